@@ -23,8 +23,6 @@ WALL_MM = 3.0
 UNUSED = (
     "Painted fissures are not used: the patient came without any, and these would pass for all of them.",
 )
-CLOSED_COST = np.float32(1.0)
-"""The cost of passing tissue that was taken for an obstacle: the highest that there is."""
 
 
 def with_corrections(
@@ -65,7 +63,8 @@ def with_corrections(
         cost = images.cost.array[box].copy()
         opened = changed & np.isinf(cost) & ~after["vessels"] & ~after["lumen"]
         if opened.any():
-            cost[opened] = CLOSED_COST
+            # What was taken for an obstacle costs as much to pass as any tissue.
+            cost[opened] = np.float32(1.0)
             made["cost"] = _with_part(images.cost, box, cost, images.grid)
     warnings = (*images.warnings, *_warnings(images.grid, before, after), *UNUSED[:unused])
     return replace(images, **made, warnings=warnings, sources=sources)

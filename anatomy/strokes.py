@@ -13,8 +13,6 @@ from anatomy.morphology import Window, bounds, pieces_of, window
 
 LONGEST_GAP_MM = 40.0
 """A gap in an airway is shorter: what lies farther apart is joined by painting."""
-AROUND_GAP_MM = 12.0
-"""A bridge over a gap leaves the straight line by no more than this."""
 AIR_HU, TISSUE_COST = -1000.0, 50.0
 """A bridge follows air: a voxel costs its HU above that of air, and at least so much for its length."""
 HuAt = Callable[[Window], Float32]
@@ -141,7 +139,8 @@ def _bridge(start: Float, end: Float, grid: Grid, hu_at: HuAt) -> Float:
             expected=f"a gap of at most {LONGEST_GAP_MM:.0f} mm",
             remedy="Paint the airway between them",
         )
-    box = grid.window(np.stack([start, end]), AROUND_GAP_MM)
+    # A bridge over a gap leaves the straight line by no more than this.
+    box = grid.window(np.stack([start, end]), 12.0)
     first = np.array([axis.start for axis in box])
     cost = np.maximum(hu_at(box).astype(np.float64) - AIR_HU, 0.0) + TISSUE_COST
     one, other = (tuple((grid.voxels(point) - first).tolist()) for point in (start, end))

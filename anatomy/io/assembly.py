@@ -113,7 +113,6 @@ def with_contents(masks: MaskSet) -> MaskSet:
 
 LUNG_ROLES: Mapping[str, str] = {"lumen": "the airway lumen", "vessels": "the vessels", "lung": "the lungs"}
 """Masks that a lung cannot be without, and what messages call them."""
-MAY_BE_EMPTY = ("fissures", "nodules")
 
 
 def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
@@ -174,7 +173,7 @@ def volumes_of(masks: MaskSet) -> tuple[dict[str, Volume], list[str]]:
 
 def _empty(role: str, masks: MaskSet) -> str:
     own = masks.files.get(role, ())
-    if role in MAY_BE_EMPTY:
+    if role in ("fissures", "nodules"):
         return f"The mask of {role} ({', '.join(own)}) is empty; it is taken as absent"
     outside = [said for said in masks.statements if any(said.startswith(file) for file in own)]
     raise AnatomyError(

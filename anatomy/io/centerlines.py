@@ -173,8 +173,6 @@ def _taken(stream: bytes, at: int, count: int) -> bytes:
 
 RADIUS_NAMES = ("Radius", "radius", "MaximumInscribedSphereRadius")
 
-_VTK_LINE, _VTK_POLY_LINE = 3, 4
-
 
 def read_centerlines(path: str | Path, *, frame: Frame | None = None) -> AirwayTree:
     """Read a centreline file as an airway tree.
@@ -277,7 +275,7 @@ def _radius(piece: VtkPiece, path: str | Path) -> Float:
 def _edges(piece: VtkPiece, path: str | Path) -> Int:
     """Return the pairs of points `(E, 2)` that follow each other on a line."""
     types = piece.cell_types
-    if types is not None and not np.isin(types, (_VTK_LINE, _VTK_POLY_LINE)).all():
+    if types is not None and not np.isin(types, (3, 4)).all():
         raise FileError(
             f"{path} holds cells of the VTK types {np.unique(types).tolist()}",
             expected="lines (3) and polylines (4) alone",

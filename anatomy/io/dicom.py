@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pydicom.dataset import FileDataset
 
 _SPACING_TOLERANCE_MM = 0.05
-_TILT_TOLERANCE_MM = 0.1
-_MISSING_FACTOR = 1.5
 _HOUNSFIELD_TYPES = ("HU", "US", "", None)
 """The standard has HU where a CT states none; US, unspecified, is what many scanners write for HU."""
 _GREY_KEYS = ("SamplesPerPixel", "PhotometricInterpretation")
@@ -332,7 +330,7 @@ def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float
             expected="one slice at each position",
             remedy="Keep one acquisition (phase, time or reconstruction) a series, and one copy of each file",
         )
-    if not gaps.max() <= _MISSING_FACTOR * spacing_mm:
+    if not gaps.max() <= 1.5 * spacing_mm:
         at = int(gaps.argmax())
         raise FileError(
             f"{where} misses slices between the heights {heights_mm[at]:.2f} and {heights_mm[at + 1]:.2f} mm",
@@ -352,7 +350,7 @@ def _slice_spacing(heights_mm: Float, names: Sequence[str], where: str) -> float
 def _require_no_tilt(positions: Float, normal: Float, where: str) -> None:
     travel = positions - positions[0]
     sideways_mm = np.linalg.norm(travel - np.outer(travel @ normal, normal), axis=1)
-    if not sideways_mm.max() <= _TILT_TOLERANCE_MM:
+    if not sideways_mm.max() <= 0.1:
         degrees = float(np.degrees(np.arctan2(sideways_mm[-1], travel[-1] @ normal)))
         raise FrameError(
             f"{where} was taken with the gantry tilted by {degrees:.2f} degrees",

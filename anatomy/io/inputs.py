@@ -13,9 +13,6 @@ from anatomy.io.corrections import corrections_file
 from anatomy.io.images import image_suffix
 from anatomy.io.own_masks import DESCRIPTION
 
-TEXT_SUFFIXES = (".txt", ".json", ".toml")
-_HEADER_LIMIT = 1 << 20
-
 
 def input_hashes(path: str | Path) -> dict[str, str]:
     """Return the SHA-256 of every file a patient may be read from, by its path in the patient's folder.
@@ -46,7 +43,7 @@ def _files_beside(folder: Path) -> set[Path]:
     return {
         file
         for file in folder.iterdir()
-        if file.is_file() and (image_suffix(file) or file.suffix in TEXT_SUFFIXES)
+        if file.is_file() and (image_suffix(file) or file.suffix in (".txt", ".json", ".toml"))
     }
 
 
@@ -55,7 +52,7 @@ def _detached_data(image: Path) -> set[Path]:
     if image_suffix(image) != ".mhd":
         return set()
     with require_file(image).open("rb") as stream:
-        named = re.search(rb"^ElementDataFile\s*=\s*(.*?)\s*$", stream.read(_HEADER_LIMIT), re.MULTILINE)
+        named = re.search(rb"^ElementDataFile\s*=\s*(.*?)\s*$", stream.read(1 << 20), re.MULTILINE)
     name = named[1].decode("utf-8", errors="replace") if named else "LOCAL"
     if name.upper() == "LOCAL":
         return set()

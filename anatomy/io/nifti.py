@@ -39,7 +39,6 @@ _DTYPES = {
     2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8",
 }  # fmt: skip
 _MM_PER_UNIT = {0: 1.0, 1: 1000.0, 2: 1.0, 3: 0.001}
-_TRANSFORM_TOLERANCE_MM = 1.0
 _HEADER_BYTES = 540
 _RAS_VECTORS, _LPS_VECTORS = 1006, 1007
 """Intent codes of fields: displacements with the axes of RAS, and vectors as ITK writes them."""
@@ -230,7 +229,7 @@ def _qform(fields: dict[str, tuple[Any, ...]], path: Path) -> Float:
 def _require_agreement(sform: Float, qform: Float, shape: tuple[int, int, int], path: Path) -> None:
     corners = list(product(*[(0, n - 1) for n in shape]))
     apart = np.abs(transform_points(sform, corners) - transform_points(qform, corners)).max()
-    if not apart <= _TRANSFORM_TOLERANCE_MM:
+    if not apart <= 1.0:
         raise FrameError(
             f"{path} states two places for the same voxels: sform and qform differ by {apart:.1f} mm",
             expected="one place",

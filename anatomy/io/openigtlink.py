@@ -18,15 +18,12 @@ from anatomy.grid import ORTHONORMAL_TOLERANCE
 from anatomy.io.frames import LPS_FROM_RAS
 
 HEADER_BYTES = 58
-NAME_BYTES = 20
 LARGEST_BYTES = 1 << 20
 """A body that claims to be larger is not what a tracker sends: the stream is damaged."""
 DAMAGED, OTHER_KIND, NOT_RIGID, CHECKSUM = "damaged", "of another kind", "not a rigid pose", "wrong checksum"
 """Why a message is dropped."""
 KINDS = ("TRANSFORM", "STRING")
 """What is read; other kinds are passed over."""
-NUMBER_TOLERANCE = 10.0 * ORTHONORMAL_TOLERANCE
-"""Poses on the wire have single precision, and trackers round."""
 
 
 @frozen_record
@@ -78,7 +75,7 @@ def _ascii(text: str) -> str:
 
 def _packed(kind: str, name: str, time_s: float, content: Any, **others: Any) -> bytes:
     device = _ascii(name)
-    if not 0 < len(device) <= NAME_BYTES:
+    if not 0 < len(device) <= 20:
         raise SettingsError(f"The device name {name!r} is too long or empty", expected="1 to 20 letters")
     made = getattr(require_pyigtl(), kind)(content, **others, timestamp=time_s, device_name=device)
     return bytes(made.pack())
@@ -153,7 +150,8 @@ def _rigid(ras_from_device: Float) -> Float | None:
     left, _sizes, right = np.linalg.svd(ras_from_device[:3, :3])
     nearest = left @ right
     off = np.abs(nearest - ras_from_device[:3, :3]).max()
-    if off > NUMBER_TOLERANCE or np.linalg.det(ras_from_device[:3, :3]) <= 0.0:
+    # Poses on the wire have single precision, and trackers round.
+    if off > 10.0 * ORTHONORMAL_TOLERANCE or np.linalg.det(ras_from_device[:3, :3]) <= 0.0:
         return None
     pose = ras_from_device.copy()
     pose[:3, :3] = nearest

@@ -22,8 +22,6 @@ from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import code_folders, kernels_folder, module_folder, say_once
 from anatomy.machine_code.sources import running
 
-KEPT_CONTENTS = 4
-"""How many contents of the sources of a module are kept: those of a few branches and versions in turn."""
 _SEAL_BYTES = 32
 
 
@@ -101,7 +99,8 @@ class KernelCache(caching._Cache):  # type: ignore[misc]
                 folder.mkdir(parents=True, exist_ok=True)
                 contents = folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*")
                 with contextlib.suppress(OSError):  # One of them may vanish meanwhile.
-                    for old in sorted(contents, key=lambda each: each.stat().st_mtime)[:-KEPT_CONTENTS]:
+                    # Contents of a few branches and versions in turn are kept.
+                    for old in sorted(contents, key=lambda each: each.stat().st_mtime)[:-4]:
                         shutil.rmtree(old, ignore_errors=True)
             _write(folder / self._file(key), hashlib.sha256(made).digest() + made)
         except OSError as error:

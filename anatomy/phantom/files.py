@@ -26,8 +26,6 @@ from anatomy.phantom.chest import LOBES
 from anatomy.phantom.patient import SCALES, Phantom
 from anatomy.phantom.rasterize import LABELS
 
-FIELD_MM = 4.0
-"""Voxels of the field that is written."""
 BORDER_MM = 12.0
 """The field goes on so far beyond the lungs."""
 
@@ -147,7 +145,7 @@ class PhantomBreathing:
         """Return grid and vectors `(ni, nj, nk, 3)` of the displacement field from end-exhale."""
         lungs = phantom.grid.lps(np.argwhere(phantom.images.lung.array))
         low, high = lungs.min(axis=0) - BORDER_MM, lungs.max(axis=0) + BORDER_MM
-        grid = Grid.over(low, high, FIELD_MM)
+        grid = Grid.over(low, high, 4.0)
         return grid, self.from_exhale(grid.centres_lps.reshape(-1, 3)).reshape(*grid.shape, 3)
 
     def source(self, phantom: Phantom) -> MotionSource:

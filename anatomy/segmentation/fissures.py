@@ -18,8 +18,6 @@ EDGE_MM = 1.0
 
 BRIGHTEST_HU = 350.0
 """Above the lung's median; a fissure is below, and vessels are cut to this so that their edges are small."""
-AGREEMENT_MM = 3.0
-"""Sigma of the neighbourhood in which normals are compared: wider than a vessel, narrower than folds."""
 BLOCK = 2
 """Normals are compared over blocks of so many voxels."""
 NOISE_PERCENTILE = 90.0
@@ -100,7 +98,8 @@ def _in_agreement(strength: Float32, normal: Float32) -> Float32:
         for b in range(a, 3):
             blocks = blocks_of(strength * normal[a] * normal[b])
             summed = blocks.mean(axis=(1, 3, 5), dtype=np.float32)
-            around = ndimage.gaussian_filter(summed, AGREEMENT_MM / BLOCK, truncate=2.5)[place]
+            # This neighbourhood is wider than a vessel and narrower than folds.
+            around = ndimage.gaussian_filter(summed, 3.0 / BLOCK, truncate=2.5)[place]
             along += np.float32(1 if a == b else 2) * normal[a][at] * normal[b][at] * around
             if a == b:
                 total += around

@@ -17,11 +17,6 @@ USUAL_SHARES: Mapping[int, tuple[float, float]] = {
     LEFT_LOWER: (0.48, 0.15),
 }
 """Mean share of each lobe in its lung, and twice the spread of the healthy, as lobes shrink and swell."""
-WEIGHT_OF_SHARES = 0.05
-"""One spread off the usual share weighs as much as a fissure over a twentieth of the lung's cross-section."""
-WEIGHT_OF_NAMES = 0.5
-"""A parting that puts all of a lung into the lobes after which its bronchi are named is worth as much as a
-fissure over half of the lung's cross-section: names decide where no fissure is seen."""
 LEAST_SHARE = 0.03
 """No lobe is smaller, unless it has collapsed."""
 TRUNK_SHARE = 0.9
@@ -148,9 +143,12 @@ def _value(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> float:
         value += float(regions.support[np.ix_(one, other)].sum()) / whole ** (2.0 / 3.0)
     for part, number in zip(parts, lobes, strict=True):
         usual, spread = USUAL_SHARES[number]
-        value -= WEIGHT_OF_SHARES * ((regions.volume[part].sum() / whole - usual) / spread) ** 2
+        # A spread off the usual share weighs as much as a fissure over 1/20 of the cross-section.
+        value -= 0.05 * ((regions.volume[part].sum() / whole - usual) / spread) ** 2
     agrees = np.where(regions.named == lobe, 1.0, -1.0) * ((lobe > 0) & (regions.named > 0))
-    value += WEIGHT_OF_NAMES * float(agrees @ regions.volume) / whole
+    # A parting that puts all of a lung into the lobes that its bronchi are named after is worth as much as a
+    # fissure over half of the cross-section: names decide where no fissure is seen.
+    value += 0.5 * float(agrees @ regions.volume) / whole
     # Most lobes have one bronchus: each further one must be worth as much as a fissure over a fiftieth.
     return value - 0.02 * (_bronchi(regions, lobe) - len(lobes))
 

@@ -33,9 +33,6 @@ LEAST_CONTRAST_HU, LEAST_HALO_HU = 120.0, 170.0
 the second to be ground glass, since the spikes of real nodules raise it by up to 150 HU."""
 HALO_VOXELS = (1.6, 3.2)
 """Ground glass around a core is looked for between these distances from it, beyond the core's own blur."""
-OPENINGS = (0.35, 0.45, 0.55, 0.65, 0.75)
-"""Radii of the opening as shares of that of the largest ball in the nodule: the first that cuts it off is
-used."""
 LEAST_RADIUS_MM = 1.2
 """Radius of the largest ball in the smallest nodule that can be told from a vessel."""
 CELL_MM = 1.5
@@ -133,7 +130,8 @@ class _Cube:
         if not LEAST_RADIUS_MM <= radius <= most_mm:
             return None
         from_middle = np.linalg.norm(self.places - self.places[:, *middle][:, None, None, None], axis=0)
-        for share in OPENINGS:
+        # Of these shares of the radius of the largest ball the first opening that cuts it off is used.
+        for share in (0.35, 0.45, 0.55, 0.65, 0.75):
             pieces = label(depth > share * radius)[0]
             core = pieces == pieces[tuple(middle)]
             # A nodule reaches this many of its radii from its middle; a vessel runs on farther.

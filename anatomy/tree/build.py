@@ -214,10 +214,6 @@ def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> V
     return [tuple((np.array(step) + low).tolist()) for step in search.traceback(target)]
 
 
-MOST_RADIUS_MM = 100.0
-"""No tube of a body is as wide as this."""
-
-
 def spanned_graph(
     points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike
 ) -> tuple[SkeletonTree, TreeReport]:
@@ -249,7 +245,7 @@ def _checked(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> t
         problem = f"the edges have the shape {pairs.shape}"
     elif not np.isfinite(points).all() or not np.isfinite(radius).all() or (radius < 0).any():
         problem = "a coordinate or radius is not finite, or a radius is negative"
-    elif radius.max() > MOST_RADIUS_MM:
+    elif radius.max() > 100.0:
         problem = f"a radius is {radius.max():.3g} mm"
     elif pairs.min() < 0 or pairs.max() >= len(points):
         problem = f"an edge names the point {pairs.max()} of {len(points)}, or a negative one"

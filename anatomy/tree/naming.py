@@ -25,7 +25,6 @@ from anatomy.poses import unit
 _Segments = tuple[int, ...]
 
 RIGHT, LEFT = "R", "L"
-LB12 = "LB1+2"
 DIRECTIONS: Mapping[str, Mapping[int, tuple[float, float, float]]] = {
     RIGHT: {
         1: (0.5, 0.0, 1.0), 2: (0.5, 1.0, 0.5), 3: (0.5, -1.0, 0.0), 4: (1.0, -0.5, -0.5),
@@ -143,7 +142,7 @@ class BronchialNames:
     @cached_property
     def segments(self) -> tuple[str, ...]:
         """The segment that each branch lies in, such as "RS6"; "" where it is not known or several."""
-        single = [name[1:2] == "B" and ("+" not in name or name == LB12) for name in self.names]
+        single = [name[1:2] == "B" and ("+" not in name or name == "LB1+2") for name in self.names]
         return tuple(n.replace("B", "S", 1) if one else "" for n, one in zip(self.names, single, strict=True))
 
 

@@ -11,6 +11,8 @@ import grimp
 import pytest
 from importlinter import cli
 
+from docs.import_graph import core, lines_of, room_of
+
 CHECKOUT = Path(__file__).resolve().parents[1]
 OURS = ("anatomy", "stages", "lungaccess")
 KERNELS_MAY_USE = {"__future__", "collections", "math", "numba", "numpy", "platform", "typing"}
@@ -135,3 +137,14 @@ def test_heavy_libraries_are_imported_only_where_they_are_used(statement: str) -
     script = f"{statement}\nimport sys\nprint(' '.join(set(sys.modules) & set({NOT_AT_START_UP!r})))"
     loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     assert loaded.stdout.split() == []
+
+
+def test_the_core_knows_no_guides_pictures_or_runs() -> None:
+    """Plans and their check need no segmentation and phantoms, and nothing that guides, shows or repeats."""
+    plugged_in = {
+        "anatomy.segmentation", "anatomy.phantom", "stages.scope.advisor", "stages.scope.route",
+        "stages.scope.tour", "lungaccess.showing", "lungaccess.running", "lungaccess.cli",
+    }  # fmt: skip
+    assert "lungaccess.planning.coupled.atlas" in core() and "stages.tube.casadi_shape" in core()
+    assert {module for module in core() if room_of(module) in plugged_in} == set()
+    assert lines_of(core()) <= 56_200

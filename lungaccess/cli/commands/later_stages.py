@@ -11,22 +11,9 @@ from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.words import of_hundred
-from lungaccess.cli import lazy, terminal
+from lungaccess.cli import lazy, options, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Seed
-from lungaccess.cli.options import (
-    BudgetOptions,
-    ErrorOptions,
-    FrameOfPose,
-    ObjectiveText,
-    OurPlannerName,
-    PatientFolder,
-    PatientOptions,
-    SystemOptions,
-    TargetOptions,
-    require_map,
-    require_picture,
-)
 from lungaccess.cli.plan_search import arcs_table, no_plan_record
 from lungaccess.cli.progress import progress
 from lungaccess.plans.no_plan import NoPlan
@@ -34,22 +21,22 @@ from stages.needle import DEFAULT, Objective
 
 
 def replan(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
     scope: str | None = None,
     tube: str | None = None,
     needle: str | None = None,
-    frame: FrameOfPose = None,
+    frame: options.FrameOfPose = None,
     plan: Path | None = None,
-    errors: ErrorOptions = ErrorOptions(),
+    errors: options.ErrorOptions = options.ErrorOptions(),
     placement: Count = 1,
     radius: Positive | None = None,
     record: Path | None = None,
-    target: TargetOptions = TargetOptions(),
-    system: SystemOptions = SystemOptions(),
-    objective: ObjectiveText = DEFAULT,
+    target: options.TargetOptions = options.TargetOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
+    objective: options.ObjectiveText = DEFAULT,
     seed: Seed = 0,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone.
 
@@ -81,7 +68,7 @@ def replan(
     lung = output.load(patient)
     if of_plan is not None:
         of_plan.require_lung(lung)
-    require_map(lung, objective)
+    options.require_map(lung, objective)
     aim, ask = stated.resolve(lung), lazy.replan_from_tube if scope is None else lazy.replan_from_scope
     try:
         with progress("planning the rest"):
@@ -100,7 +87,7 @@ class _Followed(NamedTuple):
     """What a policy follows, as it is stated."""
 
     plan: Path | None
-    errors: ErrorOptions
+    errors: options.ErrorOptions
     placement: int
     radius: float | None
     record: Path | None
@@ -109,9 +96,9 @@ class _Followed(NamedTuple):
 def _decided(
     patient: Path,
     stated: dict[str, str | None],
-    frame: FrameOfPose,
+    frame: options.FrameOfPose,
     followed: _Followed,
-    output: PatientOptions,
+    output: options.PatientOptions,
 ) -> ExitCode:
 
     procedure = followed.errors.given_procedure()
@@ -138,7 +125,9 @@ def _decided(
     return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
 
 
-def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
+def _measured(
+    scope: str | None, tube: str | None, frame: options.FrameOfPose
+) -> tuple[lazy.Float, lazy.Plan | None]:
     given = scope if tube is None else tube
     if given is None or (scope is not None and tube is not None):
         raise SettingsError(
@@ -149,7 +138,7 @@ def _measured(scope: str | None, tube: str | None, frame: FrameOfPose) -> tuple[
     return _pose(given, "scope" if tube is None else "tubes", frame)
 
 
-def _pose(given: str, stage: str, frame: FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
+def _pose(given: str, stage: str, frame: options.FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
     """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
 
     saved = lazy.parse_reference(given)
@@ -218,17 +207,17 @@ def decision_tables(decision: lazy.Decision) -> list[Table]:
 
 
 def needle(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
     start: str,
-    frame: FrameOfPose = None,
-    target: TargetOptions = TargetOptions(),
-    system: SystemOptions = SystemOptions(),
-    planner: OurPlannerName = "decide",
-    objective: ObjectiveText = "length",
-    budget: BudgetOptions = BudgetOptions(),
+    frame: options.FrameOfPose = None,
+    target: options.TargetOptions = options.TargetOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
+    planner: options.OurPlannerName = "decide",
+    objective: options.ObjectiveText = "length",
+    budget: options.BudgetOptions = options.BudgetOptions(),
     out: Path | None = None,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked.
 
@@ -243,7 +232,7 @@ def needle(
     """
 
     if out is not None:
-        require_picture(out)
+        options.require_picture(out)
     stated, weighed = target.stated(), Objective.of(objective)
     device = system.load()
     lung = output.load_organ(patient)
@@ -315,7 +304,7 @@ def _needle_tables(answer: lazy.NeedleAnswer, *, is_lung: bool) -> list[Table]:
     return [terminal.table("needle", ("", ""), rows), arcs_table(path.arcs)]
 
 
-def _start_pose(lung: lazy.Organ, start: str, frame: FrameOfPose) -> lazy.Float:
+def _start_pose(lung: lazy.Organ, start: str, frame: options.FrameOfPose) -> lazy.Float:
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
 
     if start.endswith(".json"):

@@ -12,28 +12,9 @@ from rich.panel import Panel
 from anatomy.base.errors import AnatomyError
 from anatomy.base.files import write_text
 from anatomy.base.words import of_hundred
-from lungaccess.cli import lazy, terminal
+from lungaccess.cli import lazy, options, plan_search, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, NotNegative, Seconds, Seed
-from lungaccess.cli.options import (
-    CacheOptions,
-    ErrorOptions,
-    PatientFolder,
-    PatientOptions,
-    PlaceOptions,
-    SearchOptions,
-    SystemOptions,
-    TargetOptions,
-    ToolText,
-)
-from lungaccess.cli.plan_search import (
-    RESULTS,
-    PlanJob,
-    no_plan_record,
-    plan_and_report,
-    show_headline,
-    system_of,
-)
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.plans.no_plan import NoPlan
@@ -48,7 +29,7 @@ def demo(
     # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
     seed: Seed = 1,
     force: Force = False,
-    output: CacheOptions = CacheOptions(),
+    output: options.CacheOptions = options.CacheOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it.
 
@@ -59,15 +40,15 @@ def demo(
     """
     from lungaccess.cli.anatomy_tables import anatomy_tables
 
-    search = SearchOptions(budget=budget, seed=seed)
-    claim_folder(out, RESULTS, force=force)
+    search = options.SearchOptions(budget=budget, seed=seed)
+    claim_folder(out, plan_search.RESULTS, force=force)
     with progress("making a synthetic patient") as shown:
         lung = demo_lung(seed, output.cache, shown.step)
-    target, systems = lazy.stated_target(None, 1), SystemOptions().candidates()
+    target, systems = lazy.stated_target(None, 1), options.SystemOptions().candidates()
     if not output.json:
         terminal.show(anatomy_tables(lung)[1:3])
     guide = what_to_look_at(out)
-    job = PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
+    job = plan_search.PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
     return _first_reachable_nodule(lung, job)
 
 
@@ -82,12 +63,12 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
     return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
-def _first_reachable_nodule(lung: lazy.Lung, job: PlanJob) -> ExitCode:
+def _first_reachable_nodule(lung: lazy.Lung, job: plan_search.PlanJob) -> ExitCode:
 
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
-            return plan_and_report(lung, replace(job, target=lazy.stated_target(None, number)))
+            return plan_search.plan_and_report(lung, replace(job, target=lazy.stated_target(None, number)))
         except NoPlan as error:
             terminal.progress_console.print(f"Nodule {number} cannot be reached; trying the next one.")
             failure = error
@@ -115,20 +96,20 @@ PICTURE, PAGE = "no_plan.png", "no_plan.html"
 
 
 def plan(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
-    target: TargetOptions = TargetOptions(),
-    system: SystemOptions = SystemOptions(),
-    search: SearchOptions = SearchOptions(),
-    through: PlaceOptions = PlaceOptions(),
-    errors: ErrorOptions = ErrorOptions(),
-    tool: ToolText = None,
+    target: options.TargetOptions = options.TargetOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
+    search: options.SearchOptions = options.SearchOptions(),
+    through: options.PlaceOptions = options.PlaceOptions(),
+    errors: options.ErrorOptions = options.ErrorOptions(),
+    tool: options.ToolText = None,
     thick_slices: bool = False,
     out: Path = Path("lungaccess-plan"),
     pictures: bool = True,
     explain_time: NotNegative | None = None,
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time.
 
@@ -144,17 +125,17 @@ def plan(
     stated = target.stated()
     systems = lazy.systems_with_tool(system.candidates(), tool)
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
-    claim_folder(out, RESULTS, force=force)
+    claim_folder(out, plan_search.RESULTS, force=force)
     lung = output.load(patient, thick_slices=thick_slices)
-    job = PlanJob(asked=asked, target=stated, out=out, output=output, pictures=pictures)
+    job = plan_search.PlanJob(asked=asked, target=stated, out=out, output=output, pictures=pictures)
     try:
-        return plan_and_report(lung, job)
+        return plan_search.plan_and_report(lung, job)
     except NoPlan as failure:
         # What would help is explained for the target of the masks, where nothing moves.
         if explain_time != 0.0 and not asked.request(lung, stated.resolve(lung)).is_for_window:
             record = explain_and_report(lung, job, failure, search.cost, explain_time)
         elif output.json:
-            record = no_plan_record(failure)
+            record = plan_search.no_plan_record(failure)
         else:
             raise
         if output.json:
@@ -163,7 +144,7 @@ def plan(
 
 
 def explain_and_report(
-    lung: lazy.Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
+    lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> dict[str, Any]:
     """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
 
@@ -184,7 +165,7 @@ def explain_and_report(
 
 
 def _explained(
-    lung: lazy.Lung, job: PlanJob, failure: NoPlan, cost: str, time_s: float | None
+    lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> lazy.Explanation:
 
     system, cache = job.asked.systems[0], job.output.cache
@@ -212,7 +193,7 @@ def _explained(
         )
 
 
-def _drawn(lung: lazy.Lung, job: PlanJob, explanation: lazy.Explanation) -> tuple[str, ...]:
+def _drawn(lung: lazy.Lung, job: plan_search.PlanJob, explanation: lazy.Explanation) -> tuple[str, ...]:
 
     with progress("drawing why there is no plan"):
         lazy.no_plan_png(explanation, lung, job.out / PICTURE)
@@ -252,17 +233,17 @@ WINDOW_NOTE = "window: share of the breath in which the plan is proved, %; the f
 
 
 def alternatives(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
-    target: TargetOptions = TargetOptions(),
-    system: SystemOptions = SystemOptions(),
+    target: options.TargetOptions = options.TargetOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
     count: Count = 15,
     separation: NotNegative = 5.0,
-    search: SearchOptions = SearchOptions(),
-    errors: ErrorOptions = ErrorOptions(),
+    search: options.SearchOptions = options.SearchOptions(),
+    errors: options.ErrorOptions = options.ErrorOptions(),
     out: Path = Path("lungaccess-alternatives"),
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Show plans to one target that differ, check each, and write them.
 
@@ -285,7 +266,7 @@ def alternatives(
             return lazy.open_atlas(lung, device, cache=output.cache, progress=shown.share)
 
         found = lazy.answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
-    chosen, by_success = system_of(found[0].plan, systems), request.goal is SUCCESS
+    chosen, by_success = plan_search.system_of(found[0].plan, systems), request.goal is SUCCESS
     given = (None, None) if by_success else (request.errors, request.procedure)
     appraiser = lazy.Appraiser(lung, given[0], procedure=given[1])
     appraisals = []
@@ -310,7 +291,7 @@ def _show(lung: lazy.Lung, found: tuple[lazy.Alternative, ...], appraisals: list
 
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
-    show_headline(appraisals[best].headline)
+    plan_search.show_headline(appraisals[best].headline)
     has_map = lung.cost is not None
     has_window = lung.motion is not None
     columns = [name for name in COLUMNS if (has_map or name != "map") and (has_window or name != "window")]

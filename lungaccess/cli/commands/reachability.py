@@ -11,35 +11,26 @@ from rich.table import Table
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder, write_json
 from anatomy.base.words import of_hundred, percent
-from lungaccess.cli import lazy, terminal
+from lungaccess.cli import lazy, options, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Seconds, Spacing
-from lungaccess.cli.options import (
-    PatientFolder,
-    PatientOptions,
-    PhasesText,
-    SystemOptions,
-    TargetOptions,
-    require_picture,
-    stated_phases,
-)
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 from lungaccess.plans.record import picked
 
 
 def reach(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
-    system: SystemOptions = SystemOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
     spacing: Spacing = 3.0,
     search: CountOrNone = 0,
     compare: str | None = None,
-    phases: PhasesText = None,
+    phases: options.PhasesText = None,
     out: Path = Path("lungaccess-reach"),
     page: Path | None = None,
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
 
@@ -56,7 +47,7 @@ def reach(
     others = (name.strip() for name in (compare or "").split(",") if name.strip())
     names = dict.fromkeys([system.system, *others])
     systems = [lazy.load_system(name, fissures_allowed=system.allow_fissures) for name in names]
-    asked = stated_phases(phases)
+    asked = options.stated_phases(phases)
     if asked is not None and search:
         raise SettingsError(
             "--search is asked for with --phases", expected="single arcs only", remedy="Leave out --search"
@@ -172,14 +163,14 @@ def _comparison_table(maps: tuple[lazy.ReachMap, ...]) -> Table:
 
 
 def certify(
-    patient: PatientFolder,
+    patient: options.PatientFolder,
     *,
-    target: TargetOptions = TargetOptions(),
-    system: SystemOptions = SystemOptions(),
+    target: options.TargetOptions = options.TargetOptions(),
+    system: options.SystemOptions = options.SystemOptions(),
     most_boxes: Count | None = None,
     time_s: Annotated[Seconds | None, Parameter(name="--time")] = None,
     out: Path | None = None,
-    output: PatientOptions = PatientOptions(),
+    output: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Prove that a target is unreachable: from no place in the airways, however scope and tubes are turned.
 
@@ -193,7 +184,7 @@ def certify(
     """
 
     if out is not None:
-        require_picture(out)
+        options.require_picture(out)
     stated = target.stated()
     device = system.load()
     lung = output.load(patient)

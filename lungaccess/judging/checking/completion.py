@@ -14,27 +14,13 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from lungaccess.judging.checking import shapes
+from lungaccess.judging.checking import shapes, wall_exit
 from lungaccess.judging.checking.boxes import Environment
 from lungaccess.judging.checking.outcome import recomputed_costs
 from lungaccess.judging.checking.record import wanted_clearance_mm
 from lungaccess.judging.checking.scope import beyond_carina_mm, branches_to, motion_of
 from lungaccess.judging.checking.steering import turning
-from lungaccess.judging.checking.wall_exit import (
-    WALL_ANGLE_TOLERANCE_RAD,
-    derived_exit,
-    wall_angle_rad,
-    wall_run_mm,
-)
-from lungaccess.plans.parts import (
-    DeployedShape,
-    Exemption,
-    NeedleArc,
-    NeedlePath,
-    ScopeInsertion,
-    TubeDeployment,
-    WallExit,
-)
+from lungaccess.plans import parts
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_version
 from lungaccess.problem.system import System, system_fingerprint
@@ -61,11 +47,11 @@ class Motions:
     rotation_rad: float
     outer_insertion_mm: float
     inner_insertion_mm: float
-    shape: DeployedShape
+    shape: parts.DeployedShape
     lateral_sweep_mm: float
     follow_the_leader_error_mm: float
     lps_from_tube_tip: Float
-    arcs: tuple[NeedleArc, ...]
+    arcs: tuple[parts.NeedleArc, ...]
 
 
 def completed_plan(
@@ -82,12 +68,12 @@ def completed_plan(
     """
     lung = environment.lung
     needle = system.require_needle("A plan of bare motions")
-    tube = TubeDeployment(
+    tube = parts.TubeDeployment(
         rotation_rad=motions.rotation_rad,
         outer_insertion_mm=motions.outer_insertion_mm,
         inner_insertion_mm=motions.inner_insertion_mm,
         lps_from_tip=motions.lps_from_tube_tip,
-        exit=WallExit(
+        exit=parts.WallExit(
             branch=0, point_lps=np.zeros(3), arc_length_mm=0.0, wall_angle_rad=0.0, wall_run_mm=0.0
         ),
         lateral_sweep_mm=motions.lateral_sweep_mm,
@@ -111,7 +97,9 @@ def completed_plan(
         scope=_scope(motions, environment, system),
         tube=tube,
         needle=_needle(motions, curve),
-        exemption=Exemption(branch=0, exit_point_lps=np.zeros(3), needle_length_mm=needle.exit_exemption_mm),
+        exemption=parts.Exemption(
+            branch=0, exit_point_lps=np.zeros(3), needle_length_mm=needle.exit_exemption_mm
+        ),
         required_clearance_mm=wanted_clearance_mm(system),
         clearance_mm={"tube": {}, "needle": {}},
         costs={},
@@ -125,13 +113,13 @@ def completed_plan(
     return replace(whole, costs={name: cost.value for name, cost in costs.items()})
 
 
-def _scope(motions: Motions, environment: Environment, system: System) -> ScopeInsertion:
+def _scope(motions: Motions, environment: Environment, system: System) -> parts.ScopeInsertion:
     tree = environment.lung.tree
     motion = motion_of(motions.lps_from_entry, motions.states, system.scope.bending_length_mm)
     nearest = int(environment.nearest_tree_points(motion.tip[:3, 3], 1)[0])
     branches = branches_to(tree, int(tree.branch_of_point[nearest]))
     states, lengths = motion.body_pieces()
-    return ScopeInsertion(
+    return parts.ScopeInsertion(
         lps_from_entry=motions.lps_from_entry,
         states=motions.states,
         lps_from_scope_tip=motions.lps_from_scope_tip,
@@ -151,20 +139,20 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
         return plan
     pieces = shapes.tube_pieces(plan)
     curve = shapes.integrate(plan.scope.lps_from_scope_tip, pieces)
-    derived = derived_exit(lung, curve)
+    derived = wall_exit.derived_exit(lung, curve)
     if derived is None:
         return plan
     way_out, point = derived
     curve_cut = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.cut_at(pieces, way_out.arc_mm))
     frame = int(np.abs(curve_cut.arc_mm - way_out.arc_mm).argmin())
-    run, _most = wall_run_mm(plan, environment, curve_cut, replace(way_out, frame=frame))
-    angle = wall_angle_rad(lung, point, curve.tangents[way_out.frame])
+    run, _most = wall_exit.wall_run_mm(plan, environment, curve_cut, replace(way_out, frame=frame))
+    angle = wall_exit.wall_angle_rad(lung, point, curve.tangents[way_out.frame])
     least = float(np.deg2rad(plan.system.tubes.min_wall_angle_deg))
-    stated = WallExit(
+    stated = parts.WallExit(
         branch=way_out.branch,
         point_lps=point,
         arc_length_mm=way_out.arc_mm,
-        wall_angle_rad=max(angle, min(least, angle + WALL_ANGLE_TOLERANCE_RAD)),
+        wall_angle_rad=max(angle, min(least, angle + wall_exit.WALL_ANGLE_TOLERANCE_RAD)),
         wall_run_mm=run,
     )
     whole = replace(tube, exit=stated)
@@ -172,9 +160,9 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
     return replace(plan, tube=whole, exemption=exemption)
 
 
-def _needle(motions: Motions, curve: shapes.Curve) -> NeedlePath:
+def _needle(motions: Motions, curve: shapes.Curve) -> parts.NeedlePath:
     turned, angle = turning(curve)
-    return NeedlePath(
+    return parts.NeedlePath(
         lps_from_start=motions.lps_from_tube_tip,
         arcs=motions.arcs,
         end_lps=curve.points[-1],

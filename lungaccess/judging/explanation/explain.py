@@ -20,15 +20,7 @@ from lungaccess.judging.explanation.explanation import (
     Part,
     Surroundings,
 )
-from lungaccess.planning.coupled import (
-    Atlas,
-    Counterfactual,
-    DirectArcs,
-    build_atlas,
-    direct_candidates,
-    needle_changes,
-    scope_changes,
-)
+from lungaccess.planning import coupled
 from lungaccess.planning.one_system import run
 from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.plans.no_plan import NoPlan
@@ -49,7 +41,7 @@ NO_NEEDLE = "the system has no needle"
 SHARED, KEPT, TO_BE_MADE = range(3)
 """The cost of a preset's atlas: nothing, as it is the system's own; a file to read; many seconds."""
 
-AtlasOf = Callable[[System, Callable[[float], None]], Atlas]
+AtlasOf = Callable[[System, Callable[[float], None]], coupled.Atlas]
 IsKept = Callable[[System], bool]
 
 
@@ -63,7 +55,7 @@ def explain_no_plan(
     target: Target,
     failure: NoPlan,
     *,
-    atlas: Atlas | None = None,
+    atlas: coupled.Atlas | None = None,
     objective: str | Objective = DEFAULT,
     seed: int = 0,
     time_s: float | None = DEFAULT_TIME_S,
@@ -86,11 +78,11 @@ def explain_no_plan(
             `lungaccess.planning.coupled.atlas_is_kept` does: such presets are tried first.  None is taken to
             be kept if it is not given.
     """
-    own = atlas or build_atlas(lung, system)
+    own = atlas or coupled.build_atlas(lung, system)
     task = Task(lung=lung, system=system, target=target, objective=objective_of(lung, objective), seed=seed)
     made = Explainer(
         task, own, time_s,
-        atlas_of or (lambda other, progress: build_atlas(lung, other, progress=progress)),
+        atlas_of or (lambda other, progress: coupled.build_atlas(lung, other, progress=progress)),
         is_kept or (lambda _system: False), on_part or (lambda _name: None),
     )  # fmt: skip
     return made.explanation(failure)
@@ -102,7 +94,7 @@ class Explainer:
     def __init__(
         self,
         task: Task,
-        atlas: Atlas,
+        atlas: coupled.Atlas,
         time_s: float | None,
         atlas_of: AtlasOf,
         is_kept: IsKept,
@@ -112,7 +104,7 @@ class Explainer:
         self._task, self._atlas, self._time_s = task, atlas, time_s
         self._atlas_of, self._is_kept, self._on_part = atlas_of, is_kept, on_part
         self._at_any_time = False
-        self._direct = direct_candidates(task, atlas)
+        self._direct = coupled.direct_candidates(task, atlas)
         self._checker = Checker(task.lung)
         self._parts: list[Part] = []
         self._found: dict[str, Any] = {}
@@ -182,11 +174,11 @@ class Explainer:
             self._part(name, do)
 
     @property
-    def _arcs(self) -> DirectArcs:
+    def _arcs(self) -> coupled.DirectArcs:
         """The direct arcs of the needle."""
-        if not isinstance(self._direct, DirectArcs):
+        if not isinstance(self._direct, coupled.DirectArcs):
             self._task.system.require_needle("A direct arc")
-        return cast(DirectArcs, self._direct)
+        return cast(coupled.DirectArcs, self._direct)
 
     def _alive(self) -> None:
         if self._at_any_time or self._time_s is None:
@@ -247,12 +239,12 @@ class Explainer:
         tried.append(first_attempt(plans, system, self._checker))
 
     def _needle_changes(self) -> None:
-        self._keep(needle_changes(self._task, self._atlas))
+        self._keep(coupled.needle_changes(self._task, self._atlas))
 
     def _scope_changes(self) -> None:
-        self._keep(scope_changes(self._task, self._atlas, self._alive_share))
+        self._keep(coupled.scope_changes(self._task, self._atlas, self._alive_share))
 
-    def _keep(self, found: Iterator[Counterfactual]) -> None:
+    def _keep(self, found: Iterator[coupled.Counterfactual]) -> None:
         """Check changes and keep them, each as soon as it is found."""
         if not self._atlas.deployments.count:
             return

@@ -27,16 +27,7 @@ from anatomy.lung import Lung
 from anatomy.machine_code.sources import kernel_digest
 from anatomy.motion.motion import LEFT, Motion
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.errors import (
-    IN_WINDOW,
-    NORMAL,
-    OF_SHAFT,
-    RESTING,
-    BreathingError,
-    ErrorModel,
-    PositionError,
-    Term,
-)
+from lungaccess.problem import errors
 from lungaccess.uncertainty.breathing.window import carrier
 from stages.scope import (
     Bronchoscope,
@@ -156,9 +147,9 @@ def _length(vector: Float) -> float:
     return float(np.linalg.norm(vector))
 
 
-def about_resting_tip(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
+def about_resting_tip(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorModel:
     """Return an error model in which what is about the resting shaft of a plan is stated about the plan."""
-    kinds = [kind for kind in OF_SHAFT if model.term(kind).distribution == RESTING]
+    kinds = [kind for kind in errors.OF_SHAFT if model.term(kind).distribution == errors.RESTING]
     if model.wall is None or not kinds:
         return model
     spread = resting_tip(plan, lung, model.wall)
@@ -172,12 +163,12 @@ def about_resting_tip(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     return replace(model, wall=None, place=(), **about)
 
 
-def _about(term: Term, source: str, bias: Float, patient: float, attempt: float) -> Term:
+def _about(term: errors.Term, source: str, bias: Float, patient: float, attempt: float) -> errors.Term:
     """Return an error about the plan: the bias and spread of the resting tip on top of what is stated."""
     stated = term.bias or (0.0,) * len(bias)
     both = f"{term.source}; " if term.rms else ""
     changed: dict[str, Any] = {
-        "distribution": NORMAL,
+        "distribution": errors.NORMAL,
         "source": f"{both}shaft at rest on the wall: {source}",
         f"patient_{term.unit}": round(math.hypot(term.patient, patient), DECIMALS),
         f"attempt_{term.unit}": round(math.hypot(term.attempt, attempt), DECIMALS),
@@ -199,7 +190,7 @@ def phase(share_of_time: Float) -> Float:
     return np.asarray(np.cos(np.pi * share_of_time) ** 6)
 
 
-def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
+def model_for(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorModel:
     """Return an error model at the place of a plan, with the patient's own breathing and vessels.
 
     Errors about the resting shaft are stated about the plan.
@@ -214,11 +205,11 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     motion, window, stated = lung.motion, plan.window, model.breathing
     if motion is None or motion.warning_only:
         return model
-    gated = not stated.size or stated.distribution == IN_WINDOW
+    gated = not stated.size or stated.distribution == errors.IN_WINDOW
     if gated and (window is None or not len(window.phases)):
         return model
-    term = BreathingError(
-        distribution=IN_WINDOW if gated else BreathingError.distribution,
+    term = errors.BreathingError(
+        distribution=errors.IN_WINDOW if gated else errors.BreathingError.distribution,
         median_mm=_size_mm(motion, plan),
         patient_ln=BREATHS_LN,
         source=f"the patient's own: {motion.source}; spread over breaths [Liang2018]",
@@ -226,16 +217,18 @@ def model_for(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
     return replace(model, breathing=term)
 
 
-def _with_border(model: ErrorModel, lung: Lung) -> ErrorModel:
+def _with_border(model: errors.ErrorModel, lung: Lung) -> errors.ErrorModel:
     """Return the errors with the border of the patient's own vessels, unless the model states another."""
     if not lung.vessel_border_mm or model.vessel_border.rms:
         return model
     mean, spread = lung.vessel_border_mm
     source = "the patient's own: `vessel_border_mm`, see `anatomy.segmentation.vessels.border_mm`"
-    return replace(model, vessel_border=PositionError(patient_mm=spread, bias_mm=(mean,), source=source))
+    return replace(
+        model, vessel_border=errors.PositionError(patient_mm=spread, bias_mm=(mean,), source=source)
+    )
 
 
-def _at_place(model: ErrorModel, plan: Plan, lung: Lung) -> ErrorModel:
+def _at_place(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorModel:
     """Return the errors where the scope's tip of a plan stands."""
     if not model.place:
         return model

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -59,23 +58,8 @@ EXACT = Rounds(pool=150, of_a_tip=8, draws=(1,), kept=(), fresh=0)
 """What a function says of a plan is certain."""
 
 
-class Rating(Protocol):
-    """Says how good plans are; larger is better."""
-
-    rounds: Rounds
-
-    def expected(self, direct: DirectCandidates, entries: Int) -> Float:
-        """Return what is expected of the ways from entries `(E,)` of an atlas: it only ranks them."""
-
-    def scorer(self, plan: Plan) -> Scorer:
-        """Return what scores a plan; what it prepares serves all batches."""
-
-    def stated(self, plan: Plan, most: int | None = None) -> Plan:
-        """Return a plan with what it states of the goal, of at most so many draws."""
-
-
 class ChanceRating:
-    """Counts successes under errors and a procedure.
+    """Counts successes under errors and a procedure; larger is better, as of every rating.
 
     Args:
         open_loop: Whether the request's procedure is left out, and only few draws are made, to find who takes
@@ -99,7 +83,7 @@ class ChanceRating:
         return self.procedure.scope.measured
 
     def expected(self, direct: DirectCandidates, entries: Int) -> Float:
-        """Return the chances of entries to first order."""
+        """Return the chances of entries `(E,)` of an atlas to first order: they only rank them."""
         atlas = direct.atlas
         chosen = atlas.deployments.only(entries)
         chances = Spread(
@@ -114,7 +98,10 @@ class ChanceRating:
         return chances
 
     def scorer(self, plan: Plan) -> Scorer:
-        """Return what counts the successes of a plan in a batch of draws that all plans have in common."""
+        """Return what counts the successes of a plan in a batch of draws that all plans have in common.
+
+        What it prepares serves all batches.
+        """
         if self.procedure.is_open_loop:
             assessor = RiskAssessor(plan, self._lung, radius_mm=self._given_mm)
             model = model_for(self.errors, plan, self._lung)
@@ -140,7 +127,7 @@ class ChanceRating:
         return self._seed + (1 << 24) * (batch + 1)
 
     def stated(self, plan: Plan, most: int | None = None) -> Plan:
-        """Return a plan with its chance, counted on draws that no round has seen."""
+        """Return a plan with its chance, counted on draws that no round has seen, at most so many."""
         samples = min(self.rounds.fresh, most or self.rounds.fresh)
         found = estimate_success(
             plan, self._lung, errors=self.errors, procedure=self.procedure, samples=samples,
@@ -172,6 +159,10 @@ class FunctionRating:
         if not self._goal.is_function:
             return plan
         return replace(plan, goals={self._goal.name: self._goal.computed(plan, self._lung)})
+
+
+Rating = ChanceRating | FunctionRating
+"""What says how good plans are."""
 
 
 def rating_of(request: Request) -> Rating | None:

@@ -31,11 +31,8 @@ def with_corrections(
     """Return a patient as a person corrected it, with a warning that says how much.
 
     Erased lumen takes the wall nearest to it along.  What is left of the airway is closed by a wall of one
-    voxel, and so is lumen that was added, where the patient has walls.
-
-    Args:
-        corrections: uint8, see `PAINTED`; its voxels may cover another box than those of the patient.
-        sources: SHA-256 of further files, those of the corrections.
+    voxel, and so is lumen that was added, where the patient has walls.  Corrections are uint8, see `PAINTED`,
+    and may cover another box than the patient; `sources` are the SHA-256 of their files.
     """
     found = _placed(corrections, images.grid)
     sources = {**images.sources, **(sources or {})}

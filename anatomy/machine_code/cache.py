@@ -28,8 +28,7 @@ _SEAL_BYTES = 32
 class KernelCache(caching._Cache):  # type: ignore[misc]
     """The machine code of one kernel on disk; numba's dispatcher asks it before it compiles.
 
-    Args:
-        function: The kernel before it was decorated, while its module is imported.
+    It is made of the kernel before it was decorated, while its module is imported.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -41,9 +41,6 @@ class Sources:
         To be asked while the module is imported: its file is read at that moment, and those of what it calls
         were when they were imported.  What is edited afterwards keeps the stamp of the content that runs, so
         code compiled from it is never kept under the stamp of another content.
-
-        Args:
-            module: Its dotted name, such as ``anatomy.kernels.field``.
         """
         if module not in self._stamps:
             for known in (self._texts, self._imports, self._digests):

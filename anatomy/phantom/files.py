@@ -98,11 +98,9 @@ def _tree(lines: Centerlines) -> dict[str, Any]:
 
 @frozen_value
 class PhantomBreathing:
-    """The true motion of a phantom, whose masks show end-inhale.
+    """The true motion of a phantom, whose masks show end-inhale; the carina is at x = 0.
 
-    Args:
-        apex_z_mm, height_mm: The apex at end-exhale, where nothing moves, and the height of the lungs then.
-        right_mm, left_mm: A of each lung; the carina is at x = 0.
+    Apex, where nothing moves, and height of the lungs are those at end-exhale; A is told of each lung.
     """
 
     apex_z_mm: float

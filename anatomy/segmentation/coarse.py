@@ -20,9 +20,7 @@ nothing."""
 class CoarseCt:
     """Means over blocks of the voxels of a CT in the order of `canonical`: to the left, the back, and up.
 
-    Args:
-        hu ((Ni, Nj, Nk) float32): Hounsfield units, not below -1200; contiguous along axis 0.
-        fine_shape, step: Shape of the CT, and voxels in a block, along its axes.
+    `hu` `(Ni, Nj, Nk)` is not below -1200; `fine_shape` is that of the CT, and `step` the voxels of a block.
     """
 
     hu: Float32

@@ -117,12 +117,7 @@ def blocks_of(image: Array) -> Array:
 
 @frozen_record
 class Cubic:
-    """Cubic voxels over the same box as a grid; their arrays are `(nk, nj, ni)` and C-contiguous.
-
-    Args:
-        grid: The grid of the CT.
-        shape: (nk, nj, ni) of the cubic voxels.
-    """
+    """Cubic voxels over the box of a CT's grid; their shape and arrays are `(nk, nj, ni)`, C-contiguous."""
 
     grid: Grid
     shape: tuple[int, int, int]

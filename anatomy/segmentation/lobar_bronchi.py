@@ -66,9 +66,6 @@ def lobes_of_branches(regions: Regions, lobes: tuple[int, ...]) -> Int:
     Every way to cut the tree into as many parts as there are lobes is tried; then twigs move to another part
     where that is better, because a lobe can have several bronchi.  Good is a parting whose parts meet where
     fissures are seen, have about usual shares of the lung, and hold the bronchi that are named after them.
-
-    Args:
-        lobes: Numbers of `anatomy.lobes.LOBES` in this lung.
     """
     count = len(regions.volume)
     whole = regions.volume[regions.used].sum()

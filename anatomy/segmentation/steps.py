@@ -45,8 +45,7 @@ _NOT_MASKS = ("lungs", "vesselness", "lobes", "fissures", "cost")
 class Steps:
     """Runs lungs, airway, nodule, vessels, lobes and cost map in this order; tells each step as it begins.
 
-    Args:
-        begun: Is given lungs and airway when they were made, before the longer steps.
+    `begun` is given lungs and airway when they were made, before the longer steps.
     """
 
     def __init__(

@@ -10,9 +10,6 @@ import numpy as np
 from anatomy.base.errors import AnatomyError
 from anatomy.io.images import image_stem, images_in, read_volume
 
-_SHORT = 4
-"""A name of so few letters is part of many words."""
-
 
 def plain(name: str) -> str:
     """Return a name in lower case, of letters and digits alone."""
@@ -63,6 +60,7 @@ def require_single(
 def looks_like(names: Iterable[str], images: Mapping[str, Path]) -> Path | None:
     """Return the image whose plain name is nearest to one of `names` or holds one, or None."""
     wanted = [plain(name) for name in names]
+    # A name of four letters or fewer is part of many words.
     holding = [
         path for name, path in images.items() if any(len(each) > 4 and each in name for each in wanted)
     ]

@@ -152,14 +152,10 @@ def make_phantom(
     )
 
 
-def _is_whole(number: object) -> bool:
-    return isinstance(number, int | np.integer) and not isinstance(number, bool)
-
-
 def _require_settings(seed: int, spacing_mm: float | None, size: str, noise_hu: float) -> tuple[float, float]:
     if size not in SCALES:
         raise SettingsError(f"The phantom size is {size!r}", expected=f"one of {', '.join(SCALES)}")
-    if not _is_whole(seed) or seed < 0:
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
         raise SettingsError(f"The phantom seed is {seed!r}", expected="a whole number, not negative")
     spacing_mm = DEFAULT_SPACING_MM[size] if spacing_mm is None else float(spacing_mm)
     if not FINEST_MM <= spacing_mm <= COARSEST_MM * SCALES[size]:

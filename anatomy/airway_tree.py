@@ -96,7 +96,8 @@ class AirwayTree:
     """Centreline tree of the airway; N points, B branches, parents before children.
 
     The points of a branch are consecutive.  The first point of a branch hangs on `parent_point`, a
-    point of its parent branch (its last one, or an earlier one where three or more branches part).
+    point of its parent branch (its last one, or an earlier one where three or more branches part).  Raises
+    AnatomyError if the arrays do not describe one tree.
 
     Args:
         points_lps ((N, 3) float64): LPS mm.
@@ -108,9 +109,6 @@ class AirwayTree:
         generation ((B,) int64): 0 for the trachea, one more at each branching.
         distance_from_root_mm ((N,) float64): Length along the tree.
         tangents ((N, 3) float64): Unit vectors in LPS that point away from the root.
-
-    Raises:
-        AnatomyError: If the arrays do not describe one tree.
     """
 
     points_lps: Float

@@ -15,9 +15,7 @@ class Margins:
 
     Clearance is proved against the masks. The border of a mask is wrong by some fraction of a voxel and
     more (segmentation), and the patient on the table does not lie where the image says (registration).
-
-    Raises:
-        SettingsError: If a margin is negative, not finite or absurd.
+    Raises SettingsError if a margin is negative, not finite or absurd.
     """
 
     segmentation_margin_mm: Annotated[float, _allowance_for("the border of the masks")] = 0.5

@@ -96,8 +96,7 @@ def _faces_of(padded: Mask, axis: int, side: int) -> Int:
 def smooth_surface(volume: Volume) -> SurfaceMesh:
     """Return a marching cubes surface of a bool volume, for pictures and prints.
 
-    Raises:
-        AnatomyError: If the mask is empty.
+    Raises AnatomyError if the mask is empty.
     """
     from skimage.measure import marching_cubes
 

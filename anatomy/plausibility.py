@@ -281,8 +281,7 @@ def with_accepted(findings: Iterable[Finding], names: Collection[str]) -> tuple[
 def require_plausible(findings: Collection[Finding], accepted: Collection[str]) -> tuple[str, ...]:
     """Return the names of the checks that failed and are accepted.
 
-    Raises:
-        AnatomyError: If a check failed that is not.
+    Raises AnatomyError if a check failed that is not.
     """
     failed = [each for each in findings if each.verdict in (REFUSED, ACCEPTED)]
     refused = [each for each in with_accepted(failed, accepted) if each.verdict == REFUSED]

@@ -17,10 +17,7 @@ def pose(point_lps: ArrayLike, forward: ArrayLike, sideways: ArrayLike | None = 
     """Return the read-only frame `(4, 4)` at a point `(3,)` LPS mm, +z along `forward` of any length.
 
     +x is the part of `sideways` perpendicular to `forward`; by default anterior, or superior where the device
-    points along the anterior axis.
-
-    Raises:
-        FrameError: If a direction has no length or both are parallel.
+    points along the anterior axis.  Raises FrameError if a direction has no length or both are parallel.
     """
     z = _unit(np.asarray(forward, dtype=np.float64), "forward")
     if sideways is None:

@@ -36,9 +36,8 @@ class SlottedSegment:
 def check_segments(segments: Sequence[SlottedSegment], length_mm: float = math.inf) -> None:
     """Check that segments, the foremost first, do not overlap and lie within a shaft.
 
-    Raises:
-        pydantic_core.PydanticCustomError: Where one begins before the end of another or ends beyond the
-            shaft.
+    Raises pydantic_core.PydanticCustomError where one begins before the end of another or ends beyond the
+    shaft.
     """
     at = 0.0
     for n, segment in enumerate(segments):

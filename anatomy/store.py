@@ -43,11 +43,8 @@ def open_lung(
 
     What its masks fail of `anatomy.plausibility.CHECKS` is among its warnings.  `read` reads the images, only
     if the cache does not hold the lung.  A check that fails is refused unless `accept` has its name; None
-    refuses nothing.  `reused` is that of `anatomy.build.build_lung`.
-
-    Raises:
-        AnatomyError: If a check of the masks fails that is not accepted.
-        FileError: If the cache cannot be written.
+    refuses nothing.  `reused` is that of `anatomy.build.build_lung`.  Raises AnatomyError if a check of the
+    masks fails that is not accepted, and FileError if the cache cannot be written.
     """
     key = lung_key(sources)
     folder = (cache or default_cache()) / folder_name(key)

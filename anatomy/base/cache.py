@@ -39,8 +39,7 @@ def user_cache() -> Path:
 def cache_limit_bytes() -> int:
     """Return how large the cache may grow: `$LUNGACCESS_CACHE_LIMIT`, such as 20GB, or `DEFAULT_LIMIT`.
 
-    Raises:
-        SettingsError: If the variable holds no size.
+    Raises SettingsError if the variable holds no size.
     """
     return parse_size(os.environ.get("LUNGACCESS_CACHE_LIMIT") or DEFAULT_LIMIT, "LUNGACCESS_CACHE_LIMIT")
 
@@ -48,8 +47,7 @@ def cache_limit_bytes() -> int:
 def parse_size(text: str, name: str) -> int:
     """Return the bytes that a text such as ``2GB`` or ``500 MB`` stands for; `name` says where it stood.
 
-    Raises:
-        SettingsError: If it is no size.
+    Raises SettingsError if it is no size.
 
     Examples:
         >>> parse_size("1.5GB", "--max-size")

@@ -124,8 +124,7 @@ def note_use(path: Path) -> None:
 def remove_entry(entry: CacheEntry) -> None:
     """Remove an entry; one that another process has removed, or fills, is no error.
 
-    Raises:
-        FileError: If it may not be removed.
+    Raises FileError if it may not be removed.
     """
     try:
         if entry.kind == "unfinished" and entry.path.is_dir():

@@ -47,8 +47,7 @@ def require_file(path: str | Path) -> Path:
 def read_text(path: str | Path) -> str:
     """Read a text file as any editor saves it: UTF-8, or UTF-16 with its mark, with any ends of lines.
 
-    Raises:
-        FileError: If it is none, or cannot be read.
+    Raises FileError if it is none, or cannot be read.
     """
     path = require_file(path)
     with reading(path):
@@ -83,8 +82,7 @@ def read_toml(path: str | Path, *, remedy: str, expected: str = "text in TOML sy
 def read_json(path: str | Path, *, expected: str, remedy: str) -> Any:
     """Read a JSON file; `expected` and `remedy` are for the message.
 
-    Raises:
-        FileError: If it cannot be read or is not JSON.
+    Raises FileError if it cannot be read or is not JSON.
     """
     text = read_text(path)
     try:
@@ -104,8 +102,7 @@ def reason(error: Exception) -> str:
 def reading(path: str | Path) -> Iterator[None]:
     """Turn what reading a damaged file raises into a `FileError` that names the file.
 
-    Raises:
-        FileError: If the block raises one of `DAMAGE`; typed errors pass.
+    Raises FileError if the block raises one of `DAMAGE`; typed errors pass.
     """
     try:
         yield
@@ -125,8 +122,7 @@ def unreadable(path: str | Path, error: Exception) -> FileError:
 def require_writable_folder(folder: str | Path) -> Path:
     """Make `folder` if needed and prove that files can be written into it.
 
-    Raises:
-        FileError: If the folder cannot be made or written to.
+    Raises FileError if the folder cannot be made or written to.
     """
     folder = Path(folder)
     probe = folder / f".{secrets.token_hex(6)}.probe"
@@ -142,8 +138,7 @@ def require_writable_folder(folder: str | Path) -> Path:
 def require_suffix(path: str | Path, suffix: str) -> None:
     """Refuse a file to be written whose name does not end in `suffix`, in lower or upper case.
 
-    Raises:
-        FileError: If it ends differently.
+    Raises FileError if it ends differently.
     """
     if Path(path).suffix.lower() != suffix:
         raise FileError(

@@ -19,8 +19,7 @@ from anatomy.base.errors import SettingsError
 def registered(group: str) -> dict[str, Any]:
     """Return what other packages register in a group, by its name.
 
-    Raises:
-        SettingsError: If something that is registered cannot be imported.
+    Raises SettingsError if something that is registered cannot be imported.
     """
     found = {}
     for each in entry_points(group=group):

@@ -52,8 +52,7 @@ MARK = ".lungaccess"
 def sole_writer(results: Path, folder: Path, name: str = LOCK) -> Iterator[None]:
     """Hold a lock in a folder as the one command that writes results.
 
-    Raises:
-        FileError: If another process holds it.
+    Raises FileError if another process holds it.
     """
     with contextlib.ExitStack() as stack:
         try:

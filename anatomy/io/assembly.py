@@ -158,8 +158,7 @@ def describe_yourself() -> str:
 def volumes_of(masks: MaskSet) -> tuple[dict[str, Volume], list[str]]:
     """Return the masks that are not empty as volumes, and a warning for each that is.
 
-    Raises:
-        AnatomyError: If a mask is empty that is neither of fissures nor of nodules.
+    Raises AnatomyError if a mask is empty that is neither of fissures nor of nodules.
     """
     volumes: dict[str, Volume] = {}
     warnings: list[str] = []
@@ -194,8 +193,7 @@ def require_cost(volume: Volume, grid: Grid) -> Volume:
 def require_band(volume: Volume, grid: Grid) -> Volume:
     """Return an image of fissures as uint8 on the grid of the masks; see `anatomy.lobes.UNKNOWN`.
 
-    Raises:
-        AnatomyError: If a value is none of such an image.
+    Raises AnatomyError if a value is none of such an image.
     """
     require_label_values(volume.array, "The image of the fissures' band")
     least, most = int(volume.array.min()), int(volume.array.max())

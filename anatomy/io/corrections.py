@@ -26,8 +26,7 @@ def corrections_file(path: Path) -> Path:
 def corrected(images: PatientImages, path: Path) -> PatientImages:
     """Return the images of a patient as a person corrected them, if anybody did.
 
-    Raises:
-        FileError, FrameError: If the file cannot be read.
+    Raises FileError or FrameError if the file cannot be read.
     """
     file = corrections_file(path)
     if not file.is_file():
@@ -51,8 +50,7 @@ def read_corrections(file: Path) -> Volume:
 def write_corrections(file: Path, corrections: Volume) -> None:
     """Write corrections, as small as they are; without any the file is taken away.
 
-    Raises:
-        FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     low, high = bounds(corrections.array != AS_MADE)
     if not (low < high).all():

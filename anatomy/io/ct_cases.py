@@ -49,8 +49,7 @@ def ct_case(path: Path) -> CtCase | None:
 def require_no_ct_case(path: Path) -> None:
     """Refuse a case of a data set that lacks masks, with the command that makes them.
 
-    Raises:
-        FileError: If the path is such a case, or the folder of a data set, whose cases are then listed.
+    Raises FileError if the path is such a case, or the folder of a data set, whose cases are then listed.
     """
     case = ct_case(path)
     if case is not None:

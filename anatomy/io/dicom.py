@@ -61,8 +61,7 @@ class SeriesInfo:
     def picture_hu(self) -> Float32:
         """Return the slice in the middle in HU, `(rows, columns)`.
 
-        Raises:
-            FileError: If it cannot be read, or holds no picture of grey values.
+        Raises FileError if it cannot be read, or holds no picture of grey values.
         """
         from pydicom import dcmread
 
@@ -81,8 +80,7 @@ class SeriesInfo:
 def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
     """List the DICOM series of a folder and its subfolders, ordered by UID.
 
-    Raises:
-        FileError: If there is no folder, or no DICOM image in it.
+    Raises FileError if there is no folder, or no DICOM image in it.
     """
     by_uid, _ = _headers_by_series(Path(folder))
     with _reading(folder):
@@ -92,12 +90,10 @@ def list_series(folder: str | Path) -> tuple[SeriesInfo, ...]:
 def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
     """Read a CT series in Hounsfield units, (ni, nj, nk); k runs along the normal of the slices.
 
-    Which series it is must be given when the folder holds more than one.
-
-    Raises:
-        FileError: If the choice of series is open, slices are missing, damaged, empty, doubled or unevenly
-            spaced, or the files do not state Hounsfield units.
-        FrameError: If the gantry was tilted, so that the voxels do not form a rectangular grid.
+    Which series it is must be given when the folder holds more than one.  Raises FileError if the choice of
+    series is open, slices are missing, damaged, empty, doubled or unevenly spaced, or the files do not state
+    Hounsfield units, and FrameError if the gantry was tilted, so that the voxels do not form a rectangular
+    grid.
     """
     by_uid, others = _headers_by_series(Path(folder))
     uid = _choose(by_uid, series_uid, folder)
@@ -114,8 +110,7 @@ def read_dicom(folder: str | Path, series_uid: str | None = None) -> Volume:
 def series_headers(folder: Path, series_uid: str | None = None) -> list[FileDataset]:
     """Return the headers of the slices of a series, by the names of their files.
 
-    Raises:
-        FileError: If the choice of series is open, or a slice cannot be read.
+    Raises FileError if the choice of series is open, or a slice cannot be read.
     """
     by_uid, _others = _headers_by_series(folder)
     chosen = by_uid[_choose(by_uid, series_uid, folder)]

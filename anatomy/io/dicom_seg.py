@@ -208,9 +208,8 @@ def segment_names(path: Path) -> Mapping[int, str]:
 def read_segments(path: Path) -> Volume:
     """Read masks as a label map, in which later ones cover earlier ones.
 
-    Raises:
-        FileError: If the file is no Segmentation object or Structure Set, or damaged.
-        SettingsError: If the extra `dicom` is not installed.
+    Raises FileError if the file is no Segmentation object or Structure Set, or damaged, and SettingsError if
+    the extra `dicom` is not installed.
     """
     with _opened(path) as found:
         return found.label_map()

@@ -57,11 +57,9 @@ def _point_error(text: str, problem: str) -> FrameError:
 def read_pose(path: str | Path, frame: Frame | None) -> Float:
     """Read a 4x4 pose `lps_from_tip`, LPS mm, from 16 numbers; +z is the direction of insertion.
 
-    The file cannot state the frame of its numbers: that is given, and None is refused.
-
-    Raises:
-        FileError: If the file does not hold 4x4 finite numbers.
-        FrameError: If the frame is not stated, or the matrix is not a right-handed rigid pose.
+    The file cannot state the frame of its numbers: that is given, and None is refused.  Raises FileError if
+    the file does not hold 4x4 finite numbers, and FrameError if the frame is not stated, or the matrix is not
+    a right-handed rigid pose.
     """
     matrix = _numbers(path)
     if frame is None:
@@ -90,8 +88,7 @@ def read_pose(path: str | Path, frame: Frame | None) -> Float:
 def read_points(path: str | Path, frame: Frame) -> Float:
     """Read points from a text file of three numbers a point; return `(N, 3)` float64, LPS mm.
 
-    Raises:
-        FileError: If the file does not hold a multiple of three finite numbers.
+    Raises FileError if the file does not hold a multiple of three finite numbers.
     """
     values = _numbers(path).ravel()
     if values.size == 0 or values.size % 3:

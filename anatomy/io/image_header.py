@@ -114,8 +114,7 @@ def not_begun(path: Path, format_name: str, expected: str) -> FileError:
 def require_lengths(values: Sequence[float], name: str, path: Path) -> Float:
     """Return the distances of voxels, or of vectors' ends, that a header states, as `(n,)` float64.
 
-    Raises:
-        FrameError: If one is not positive: programs differ in what they then read.
+    Raises FrameError if one is not positive: programs differ in what they then read.
     """
     stated = np.array(values, dtype=np.float64)
     if not (stated > 0.0).all():
@@ -169,8 +168,7 @@ def fields_once(pairs: Iterable[tuple[str, str]], path: Path) -> dict[str, str]:
 def named_grid(shape: tuple[int, int, int], lps_from_ijk: Float, path: Path) -> Grid:
     """Make a grid; a `FrameError` names the file it came from.
 
-    Raises:
-        FrameError: If the matrix is none of a grid, or a corner lies absurdly far away.
+    Raises FrameError if the matrix is none of a grid, or a corner lies absurdly far away.
     """
     try:
         grid = Grid(shape=shape, lps_from_ijk=lps_from_ijk)

@@ -191,14 +191,12 @@ def write_volume(
 ) -> None:
     """Write a volume as .nii, .nii.gz, .nrrd or .seg.nrrd, with its frame stated; masks become 0 and 1.
 
-    The file appears complete or not at all.
+    The file appears complete or not at all.  Raises FileError if the ending is unknown or the folder cannot
+    be written to.
 
     Args:
         header: `key:=value` lines of a .nrrd file, such as those that name the segments of .seg.nrrd.
         note: What the header of a NIfTI file says of its voxels, at most 79 letters.
-
-    Raises:
-        FileError: If the ending is unknown or the folder cannot be written to.
     """
     path = Path(path)
     if image_suffix(path) not in (".nii", ".nii.gz", ".nrrd", ".seg.nrrd"):

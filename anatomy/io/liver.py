@@ -24,9 +24,8 @@ def is_liver(folder: Path) -> bool:
 def load_liver(folder: Path) -> LiverImages:
     """Read a liver of Med-RAD.
 
-    Raises:
-        AnatomyError: If the liver or a vessel tree is missing or empty.
-        FileError, FrameError: As `anatomy.io.load_patient`.
+    Raises AnatomyError if the liver or a vessel tree is missing or empty, and FileError or FrameError as
+    `anatomy.io.load_patient`.
     """
     images = by_name(folder)
     files = {"liver": "liver", **LUMENS}

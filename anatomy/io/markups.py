@@ -91,9 +91,8 @@ def parse_reference(text: str) -> Reference | None:
 def read_named_point(reference: Reference) -> ControlPoint:
     """Return the point of a label, or the only point of a list or curve of that name.
 
-    Raises:
-        FileError: If the file is none of 3D Slicer's, or holds not exactly one such point.
-        FrameError: If its frame is not stated, or a transform moves it that is not hardened.
+    Raises FileError if the file is none of 3D Slicer's, or holds not exactly one such point, and FrameError
+    if its frame is not stated, or a transform moves it that is not hardened.
     """
     markups = read_markups(reference.file)
     by_label = [point for each in markups for point in each.points if point.label == reference.name]
@@ -104,8 +103,7 @@ def read_named_point(reference: Reference) -> ControlPoint:
 def read_named_pose(reference: Reference) -> Float:
     """Return the pose `(4, 4)` LPS mm of a point that has a direction of its own, see `read_named_point`.
 
-    Raises:
-        FrameError: If the point states no direction, or its frame is not that of a rigid body.
+    Raises FrameError if the point states no direction, or its frame is not that of a rigid body.
     """
     point = read_named_point(reference)
     if not point.oriented:

@@ -138,8 +138,7 @@ def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]
 def require_roles(folder: Path, sources: list[MaskSource]) -> None:
     """Refuse a folder that lacks a mask, and say which file is missing and which one looks like it.
 
-    Raises:
-        AnatomyError: If lumen, vessels, or lungs and lobes are missing.
+    Raises AnatomyError if lumen, vessels, or lungs and lobes are missing.
     """
     found = {"lung" if source.role == "lobes" else source.role for source in sources}
     missing = [role for role in LUNG_ROLES if role not in found]

@@ -184,10 +184,9 @@ def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
 def read_vectors(path: Path) -> tuple[Grid, Float]:
     """Return the grid and the vectors `(ni, nj, nk, 3)` LPS mm of an image of displacements.
 
-    Raises:
-        FileError: If it is no complete image of three dimensions with three numbers a voxel.
-        FrameError: If it states no frame, its vectors may not be LPS, or its axes are not perpendicular.
-        AnatomyError: If a number is not finite.
+    Raises FileError if it is no complete image of three dimensions with three numbers a voxel, FrameError if
+    it states no frame, its vectors may not be LPS, or its axes are not perpendicular, and AnatomyError if a
+    number is not finite.
     """
     with reading(path):
         header, stream = open_image(path, None, components=3)
@@ -200,9 +199,8 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
 def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
     """Return grid and displacements of an ITK transform, evaluated over the grid of the masks.
 
-    Raises:
-        FileError: If it is no transform of three dimensions that ITK reads.
-        AnatomyError: If it moves nothing, or farther than a lung is large.
+    Raises FileError if it is no transform of three dimensions that ITK reads, and AnatomyError if it moves
+    nothing, or farther than a lung is large.
     """
     if path.suffix.lower() not in TRANSFORMS:
         raise FileError(
@@ -246,8 +244,7 @@ def _finite(vectors: Array, path: Path) -> Float:
 def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
     """Write a displacement field, `(ni, nj, nk, 3)` LPS mm, in single precision, as `read_vectors` reads it.
 
-    Raises:
-        FileError: If the folder cannot be written to.
+    Raises FileError if the folder cannot be written to.
     """
     write_image(itk_image(vectors.astype(np.float32), grid), Path(path), components=3)
 

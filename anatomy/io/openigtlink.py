@@ -96,9 +96,8 @@ class Decoder:
     def feed(self, data: bytes) -> Iterator[Received]:
         """Take some bytes, and yield the messages that they complete.
 
-        Raises:
-            FileError: If the bytes are no messages of OpenIGTLink: then nothing after them can be read, and
-                the connection is of no further use.
+        Raises FileError if the bytes are no messages of OpenIGTLink: then nothing after them can be read, and
+        the connection is of no further use.
         """
         self._left += data
         while len(self._left) >= HEADER_BYTES:

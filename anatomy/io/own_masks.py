@@ -131,8 +131,7 @@ def load_own_masks(description: Path) -> PatientImages:
 def motion_alone(description: Path) -> MotionFile | None:
     """Return the motion that a `patient.toml` names; None if it names anything else, such as masks.
 
-    Raises:
-        SettingsError: If the file is no TOML, or a key of the motion is unknown.
+    Raises SettingsError if the file is no TOML, or a key of the motion is unknown.
     """
     content = _read_content(description)
     return parse(MotionFile, content["motion"], description.name) if [*content] == ["motion"] else None
@@ -141,8 +140,7 @@ def motion_alone(description: Path) -> MotionFile | None:
 def with_motion(images: PatientImages, keys: MotionFile, description: Path) -> PatientImages:
     """Return images with a motion that a `patient.toml` in their folder names.
 
-    Raises:
-        AnatomyError, FileError, FrameError, SettingsError: As `load_own_masks`.
+    Raises AnatomyError, FileError, FrameError or SettingsError as `load_own_masks`.
     """
     folder = description.parent
     hashes = {description.name: sha256(description)}
@@ -154,8 +152,7 @@ def with_motion(images: PatientImages, keys: MotionFile, description: Path) -> P
 def thick_slices_mm(path: str | Path) -> float:
     """Return the distance of the slices of a patient's CT if its description marks them as thick, else 0.
 
-    Raises:
-        SettingsError: If there is a description, and it is wrong.
+    Raises SettingsError if there is a description, and it is wrong.
     """
     path = Path(path)
     description = path / DESCRIPTION if path.is_dir() else path
@@ -167,8 +164,7 @@ def thick_slices_mm(path: str | Path) -> float:
 def require_thin_slices(path: str | Path) -> None:
     """Refuse a patient whose masks were made from thick slices.
 
-    Raises:
-        SettingsError: If they were, or the description is wrong.
+    Raises SettingsError if they were, or the description is wrong.
     """
     distance_mm = thick_slices_mm(path)
     if distance_mm:

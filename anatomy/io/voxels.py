@@ -32,8 +32,7 @@ def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> It
 def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
     """Yield the decompressed rest of `stream` (gzip, also several members, or zlib).
 
-    Raises:
-        FileError: If the stream is damaged or ends early; `path` is named.
+    Raises FileError if the stream is damaged or ends early; `path` is named.
     """
     decoder, pending = zlib.decompressobj(_ANY_HEADER), b""
     try:

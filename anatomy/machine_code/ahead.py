@@ -187,8 +187,7 @@ def _compiled_in_order(waits_for: dict[int, set[int]], processes: int) -> Iterat
 def encoded(kind: Any) -> Any:
     """Return one of numba's types as plain values.
 
-    Raises:
-        TypeError: If it is a type that no kernel is called with from Python.
+    Raises TypeError if it is a type that no kernel is called with from Python.
     """
     from numba import types
 
@@ -214,8 +213,7 @@ def encoded(kind: Any) -> Any:
 def decoded(plain: Any) -> Any:
     """Return the type that `encoded` returned as these values.
 
-    Raises:
-        ImportError, AttributeError, LookupError, TypeError, ValueError: If there is none.
+    Raises ImportError, AttributeError, LookupError, TypeError or ValueError if there is none.
     """
     from numba import types
 

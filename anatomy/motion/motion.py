@@ -81,8 +81,7 @@ class Motion:
     def share(self, phase: float) -> float:
         """Return which share of d places of the masks are moved by in a phase, negative before the masks'.
 
-        Raises:
-            SettingsError: If the phase is not from 0 to 1.
+        Raises SettingsError if the phase is not from 0 to 1.
         """
         return self.amplitude * (require_phase(phase) - self.masks_phase)
 

@@ -41,9 +41,7 @@ def write_phantom(
     `truth.json` holds the centrelines, the nodules and the meaning of the labels (LPS mm). Without `with_ct`
     there is no CT, which takes most of the room.  With `breathing` there is `motion.nrrd` as well, and
     `patient.toml` names it.  `patient.toml` is written last, so that a folder that has it is complete.
-
-    Raises:
-        FileError: If the folder cannot be written to.
+    Raises FileError if the folder cannot be written to.
     """
     folder = require_writable_folder(folder)
     images = phantom.images

@@ -229,8 +229,7 @@ def plan_patient(
 ) -> PatientPlan:
     """Plan trees and nodules for a territory of `scale` times adult size and voxels of `spacing_mm`.
 
-    Raises:
-        AnatomyError: If three nodules do not fit.
+    Raises AnatomyError if three nodules do not fit.
     """
     bullae = place_bullae(territory, traits.emphysema, scale, rng)
     # The diameter at which vessels end: in small patients later, in coarse voxels earlier.

@@ -60,8 +60,7 @@ class Territory:
 def make_territory(chest: Chest, rng: np.random.Generator) -> Territory:
     """Map the lobes of a chest at `MAP_SPACING_MM` times its scale and spread points in them.
 
-    Raises:
-        AnatomyError: If a lobe is empty.
+    Raises AnatomyError if a lobe is empty.
     """
     import edt
 

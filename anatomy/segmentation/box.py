@@ -42,8 +42,7 @@ class Box:
     def whole(cls, ct_grid: Grid, voxel_mm: float) -> Self:
         """Return the finer voxels of a whole CT.
 
-        Raises:
-            SettingsError: If the size of the voxels is out of its range.
+        Raises SettingsError if the size of the voxels is out of its range.
         """
         if not VOXEL_RANGE_MM[0] <= voxel_mm <= VOXEL_RANGE_MM[1]:
             raise SettingsError(
@@ -117,8 +116,7 @@ class Box:
     def placed(self, volume: Volume, name: str) -> Array:
         """Return an image whose voxels are those of the CT, or its finer ones, on the voxels of the box.
 
-        Raises:
-            GridMismatchError: If its voxels are neither.
+        Raises GridMismatchError if its voxels are neither.
         """
         try:
             return onto_grid(volume, self.grid, name).array
@@ -128,8 +126,7 @@ class Box:
     def placed_on_ct(self, volume: Volume, name: str) -> Volume:
         """Return such an image on the voxels of the CT; the finer voxels are looked at in the box alone.
 
-        Raises:
-            GridMismatchError: If its voxels are neither.
+        Raises GridMismatchError if its voxels are neither.
         """
         try:
             return onto_grid(volume, self.ct_grid, name)

@@ -94,8 +94,7 @@ def _long_enough(ct: CoarseCt, found: CentralAirway) -> CentralAirway:
 def grow_from(ct: CoarseCt, outside: Mask, seed_lps: Float) -> CentralAirway:
     """Follow the large airways from a point in them, staying out of `outside`.
 
-    Raises:
-        AnatomyError: If the point does not lie in air, or that air is not enclosed by a wall.
+    Raises AnatomyError if the point does not lie in air, or that air is not enclosed by a wall.
     """
     seed = _given_seed(ct, seed_lps)
     grown = grow(ct, seed, outside)

@@ -78,8 +78,7 @@ class SegmentationFolder:
     def correction(self, name: str) -> Path | None:
         """Return the file that a person put in place of an image, or None.
 
-        Raises:
-            AnatomyError: If there are two of them.
+        Raises AnatomyError if there are two of them.
         """
         paths = [self.path / FOLDER / f"{name}{suffix}" for suffix in SUFFIXES]
         found = [path for path in paths if path.is_file()]
@@ -207,8 +206,7 @@ class SegmentationFolder:
 def _read_record(path: Path) -> dict[str, Any]:
     """Return the record of a folder; empty if there is none, or of another format.
 
-    Raises:
-        FileError: If it is damaged: nothing else tells which images a person corrected.
+    Raises FileError if it is damaged: nothing else tells which images a person corrected.
     """
     if not path.is_file():
         return {"format": FORMAT}
@@ -244,8 +242,7 @@ def digest_of_ct(ct: Volume) -> str:
 def segmented_ct(folder: Path) -> dict[str, Any] | None:
     """Return path, UID of the series and digest of the CT of a segmentation; None if they are not recorded.
 
-    Raises:
-        FileError: If the record of the segmentation is damaged.
+    Raises FileError if the record of the segmentation is damaged.
     """
     if not (folder / STATE).is_file():
         return None

@@ -70,8 +70,7 @@ class Network:
 def read_network(path: Path) -> Network:
     """Read the settings of a network from the TOML file of the same name beside it, if there is one.
 
-    Raises:
-        FileError, SettingsError: If there is no such file, or its settings are wrong.
+    Raises FileError or SettingsError if there is no such file, or its settings are wrong.
     """
     if path.suffix != SUFFIX or not path.is_file():
         raise FileError(

@@ -106,8 +106,7 @@ def segment_lungs(
 def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | None = None) -> Lungs:
     """Make `Lungs` of masks from elsewhere: closed and filled like our own, and with our own trachea.
 
-    Raises:
-        AnatomyError: If there is no trachea.
+    Raises AnatomyError if there is no trachea.
     """
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
     coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
@@ -154,8 +153,7 @@ def in_hounsfield(
     """Return the coarse CT in Hounsfield units, the air around the patient, how its values became them, and
     what may be its `central_airways`.
 
-    Raises:
-        AnatomyError: If there is no trachea.
+    Raises AnatomyError if there is no trachea.
     """
     outside = outside_air(coarse.hu, coarse.hu < FIRST_THRESHOLD_HU)
     airways = central_airways(coarse, outside, seed)

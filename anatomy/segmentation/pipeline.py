@@ -193,11 +193,8 @@ def _provenance(request: SegmentationRequest, steps: Steps, warnings: list[str])
 def read_ct(path: str | Path, series_uid: str | None = None) -> tuple[Volume, dict[str, str]]:
     """Read a CT from an image file or a folder of DICOM files, in the order of voxels of `canonical`.
 
-    Also returned are the files read, with their SHA-256.
-
-    Raises:
-        FileError, FrameError: If there is no CT, or it cannot be read; see `anatomy.io.read_dicom` and
-            `anatomy.io.read_volume`.
+    Also returned are the files read, with their SHA-256.  Raises FileError or FrameError if there is no CT,
+    or it cannot be read; see `anatomy.io.read_dicom` and `anatomy.io.read_volume`.
     """
     from anatomy.base.errors import FileError
     from anatomy.base.files import sha256

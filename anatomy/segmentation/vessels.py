@@ -193,12 +193,9 @@ def segment_vessels(
     """Find the vessels inside the lungs; those of `large_radius_mm` or more are `large`.
 
     The CT has Hounsfield units; `lungs` `(ni, nj, nk)` are both lungs, filled; lumen and wall of the airways
-    never become vessel.  The result does not depend on the threads, 0 for all processors.
-
-    Raises:
-        GridMismatchError: If the shapes differ.
-        AnatomyError: If the lung is empty.
-        SettingsError: If the radius is none of `LARGE_RADII_MM` or between.
+    never become vessel.  The result does not depend on the threads, 0 for all processors.  Raises
+    GridMismatchError if the shapes differ, AnatomyError if the lung is empty, and SettingsError if the radius
+    is none of `LARGE_RADII_MM` or between.
     """
     require_large_radius(large_radius_mm)
     shape = ct.array.shape

@@ -27,10 +27,8 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
     """Make the airway tree of a mask of the lumen, trachea included [Lee1994].
 
     Every point and every step between neighbouring points lies in the lumen, except across the gaps in
-    `report.gaps_bridged`.  See `docs/explanation/airway_tree.md`.
-
-    Raises:
-        AnatomyError: If the mask is empty, has no trachea, or is noise.
+    `report.gaps_bridged`.  See `docs/explanation/airway_tree.md`.  Raises AnatomyError if the mask is empty,
+    has no trachea, or is noise.
     """
     prepared = prepare_lumen(lumen, max_gap_mm=5.0)
     grid = prepared.grid
@@ -67,15 +65,13 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
     """Make the airway tree of a centreline graph with a radius at every point.
 
     The points are kept as they are.  Points that coincide to 0.001 mm become one.  Of several
-    separate pieces the one with most points is kept; a ring is opened where it is narrowest.
+    separate pieces the one with most points is kept; a ring is opened where it is narrowest.  Raises
+    AnatomyError if the arrays are empty, do not fit together, hold no finite numbers or no trachea.
 
     Args:
         points_lps ((N, 3) float64): LPS mm.
         radius_mm: (N,) float64.
         edges ((E, 2) int64): Pairs of points that are neighbours along a branch.
-
-    Raises:
-        AnatomyError: If the arrays are empty, do not fit together, hold no finite numbers or no trachea.
     """
 
     skeleton, report = spanned_graph(points_lps, radius_mm, edges)

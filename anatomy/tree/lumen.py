@@ -44,8 +44,7 @@ class PreparedLumen:
 def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     """Crop a mask and keep its largest 26-connected piece with what belongs to it.
 
-    Raises:
-        AnatomyError: If the mask is empty, or falls into thousands of pieces.
+    Raises AnatomyError if the mask is empty, or falls into thousands of pieces.
     """
     from scipy import ndimage
 
@@ -195,8 +194,7 @@ MOST_PATHS = 500
 def complete(skeleton: Int, prepared: PreparedLumen) -> Int:
     """Return the skeleton voxels `(M, 3)` with paths to all parts of the mask that they do not reach.
 
-    Raises:
-        AnatomyError: If more than `MOST_PATHS` parts are not reached.
+    Raises AnatomyError if more than `MOST_PATHS` parts are not reached.
     """
     from scipy import ndimage
 

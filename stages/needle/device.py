@@ -17,11 +17,8 @@ class Needle:
 
     Its shaft is a tube like any other, which stiffens the tubes that aim it.  Without further keys it is a
     solid wire of superelastic NiTi, the stiffest of its diameter and material; `youngs_modulus_gpa = 0` says
-    that its stiffness is to be neglected.
-
-    Raises:
-        SettingsError: If a value is not finite or absurd, the bore is as wide as the needle, or slotted
-            segments overlap.
+    that its stiffness is to be neglected.  Raises SettingsError if a value is not finite or absurd, the bore
+    is as wide as the needle, or slotted segments overlap.
     """
 
     diameter_mm: Annotated[float, quantity("outer diameter of the needle", above=0.0, at_most=5.0)]

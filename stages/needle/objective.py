@@ -78,7 +78,7 @@ class Objective:
     """A weighted sum of costs of a plan.
 
     The text of an objective is the key of a cost, or a sum such as ``cost_map=0.5,length_mm=1``; `of` reads
-    it and `str` writes it.
+    it and `str` writes it.  Raises SettingsError if a weight is negative or not finite, or all are 0.
 
     Args:
         inverse_clearance: Weight of the integral of 1 / clearance over arc length [Kuntz2015, eq. 1].
@@ -89,9 +89,6 @@ class Objective:
             meets again on another arc counts again, which `stages.needle.costs.voxel_sum` does not.
         tissue: Weight of the integral, over tubes and needle in tissue, of their width times the sum of 1 /
             clearance and the cost map, 1/mm; see `stages.needle.costs.tissue`.
-
-    Raises:
-        SettingsError: If a weight is negative or not finite, or all are 0.
 
     Examples:
         >>> str(Objective(length=1.0))
@@ -206,15 +203,12 @@ class Objective:
 
         They are those of a needle, whose width is the same everywhere.  The least cost of a mm is a proved
         lower bound.  The voxel sum adds nothing to it: however small the cost, an arc can be so short that
-        it enters no other voxel.
+        it enters no other voxel.  Raises SettingsError if the objective weighs a map, and there is none, or
+        one with negative costs, NaN, or no finite cost.
 
         Args:
             cost_map ((ni, nj, nk) float32 or None): Not negative; infinite is an obstacle.
             width_mm: Outer diameter of the needle.
-
-        Raises:
-            SettingsError: If the objective weighs a map, and there is none, or one with negative costs, NaN,
-                or no finite cost.
         """
         if self.weighs_map and cost_map is None:
             raise SettingsError(

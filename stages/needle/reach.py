@@ -58,16 +58,13 @@ ORDER_SEED = 1
 class ReachScan:
     """Many start poses in one needle environment, to be asked about any number of points.
 
-    It may be used by several threads at once.
+    It may be used by several threads at once.  Raises SettingsError if `arcs` is below 1 or `trees` below 0.
 
     Args:
         positions, tangents ((E, 3) float64, LPS mm): Start poses; neighbours in the list should be alike.
         branches ((E,) int64): Branch whose wall each has pierced; -1 for none.
         arcs: Clear arcs of which the cheapest is improved.
         trees: RRTs for each point that no single arc reaches; 0 for no search at all.
-
-    Raises:
-        SettingsError: If `arcs` is below 1 or `trees` below 0.
     """
 
     def __init__(

@@ -226,9 +226,8 @@ _seeds: list[int] = []
 def seed_ompl(seed: int) -> None:
     """Make OMPL's own planners repeatable; call it before anything else is made with OMPL.
 
-    Raises:
-        SettingsError: If OMPL has been seeded or has drawn random numbers in this process already, or the
-            seed is less than 1.
+    Raises SettingsError if OMPL has been seeded or has drawn random numbers in this process already, or the
+    seed is less than 1.
     """
     level = util.getLogLevel()
     util.setLogLevel(util.LogLevel.LOG_NONE)

@@ -227,16 +227,14 @@ class Replanner:
     number of iterations, for what is cheaper.  Nothing depends on a clock.
 
     Limits count from the needle's first start: length and turn behind the tip, the exemption at the exit,
-    and the angle, which is measured from the first direction.
+    and the angle, which is measured from the first direction.  Raises SettingsError if `iterations` is
+    negative.
 
     Args:
         query: What the plan was made for.
         plan: From the query's start.
         iterations: Of the search, for each replan.
         seed: The same seed and the same sequence of calls give the same replans.
-
-    Raises:
-        SettingsError: If `iterations` is negative.
     """
 
     def __init__(

@@ -112,14 +112,12 @@ class Cells:
     """Cells of poses: of all that fall into one cell, only the cheapest so far is followed.
 
     What a search with cells says holds up to them: a path that was not looked for leaves a cell in which
-    a pose that costs no more was followed, in place of its own.
+    a pose that costs no more was followed, in place of its own.  Raises SettingsError if a size is not
+    positive and finite.
 
     Args:
         position_mm: Side of a cell, mm.
         angle_deg: Side in each component of the tip's direction, as the angle at its centre, degrees.
-
-    Raises:
-        SettingsError: If a size is not positive and finite.
     """
 
     position_mm: float = 0.5

@@ -228,8 +228,7 @@ class ScopeMotions:
     def nearest(self, point_lps: ArrayLike, forward: ArrayLike) -> int:
         """Return the tip nearest to a pose; 10 degrees count as much as 1 mm.
 
-        Raises:
-            AnatomyError: If there is no tip.
+        Raises AnatomyError if there is no tip.
         """
         if not self.count:
             raise AnatomyError(

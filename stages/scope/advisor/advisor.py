@@ -227,14 +227,12 @@ class Advisor:
         """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
 
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
-        reproduction); where none is valid even then, the advice is to pull back as the scope came.
+        reproduction); where none is valid even then, the advice is to pull back as the scope came.  Raises
+        AnatomyError if the tip is not in the lumen.
 
         Args:
             own: A motion that the user is about to make, evaluated at its own advance, at most the
                 look-ahead.
-
-        Raises:
-            AnatomyError: If the tip is not in the lumen.
         """
         tip = tip_frames(self.environment.model, state.array)[0][:3, 3]
         voxel = self.environment.lumen.voxel_at(tip)
@@ -311,10 +309,7 @@ def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState
     """Return the first state, from the root on, at which the straight scope fits in the trachea.
 
     Twist 0 and a positive bend turn the tip anteriorly, or superiorly where the trachea is parallel to that
-    axis.
-
-    Raises:
-        AnatomyError: If the scope fits nowhere in the trachea.
+    axis.  Raises AnatomyError if the scope fits nowhere in the trachea.
     """
     field = navigation_field(lumen, lumen.nearest_voxel(tree.carina_lps)[0])
     environment = ScopeEnvironment(model=model, field=field)

@@ -27,10 +27,8 @@ class ScopeModel:
     """A chain of n = `links` links of length l; the defaults are those of [Rosell2012].
 
     n l is the length of the bending tip.  The ranges of the twist alpha and of the bend beta, which is that
-    of all links together, hold 0; `bend_step_deg` is the spacing of the candidates' bends (eq. 3).
-
-    Raises:
-        SettingsError: If a value is absurd, or one joint would bend by 90 degrees or more.
+    of all links together, hold 0; `bend_step_deg` is the spacing of the candidates' bends (eq. 3).  Raises
+    SettingsError if a value is absurd, or one joint would bend by 90 degrees or more.
     """
 
     links: Annotated[int, Field(description="links with coupled joints", strict=True, ge=1, le=200)] = 10
@@ -125,10 +123,8 @@ def advanced(
 ) -> ScopeState:
     """Algorithm 1 of [Rosell2012]: return the state with a new twist and bend, advanced along its circle.
 
-    A negative distance with the present twist and bend takes an advance back exactly.
-
-    Raises:
-        SettingsError: If a value is not finite, or a joint would bend by 180 degrees or more.
+    A negative distance with the present twist and bend takes an advance back exactly.  Raises SettingsError
+    if a value is not finite, or a joint would bend by 180 degrees or more.
     """
     values = (distance_mm, twist_rad, bend_rad)
     if not np.isfinite(values).all() or abs(bend_rad) >= math.pi * model.links:

@@ -121,8 +121,7 @@ class Lumen:
 def lumen_of_lung(lung: Lung) -> Lumen:
     """Return the lumen that hangs together with the root of a lung's airway tree.
 
-    Raises:
-        AnatomyError: If the lung has no lumen.
+    Raises AnatomyError if the lung has no lumen.
     """
     mask = lung.mask("lumen")
     return _lumen(mask, lung.tree.points_lps[0], lung.lumen_depth)
@@ -131,8 +130,7 @@ def lumen_of_lung(lung: Lung) -> Lumen:
 def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:
     """Return the piece of a bool mask nearest to a point `(3,)` LPS mm.
 
-    Raises:
-        AnatomyError: If the mask is empty.
+    Raises AnatomyError if the mask is empty.
     """
     return _lumen(mask, root_lps, None)
 

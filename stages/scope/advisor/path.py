@@ -144,10 +144,7 @@ def camera_flight(
     """Return the camera's poses along a path, up to the state nearest to the goal.
 
     Between two states base, twist and bend move evenly; there are so many poses that the camera neither
-    moves nor turns farther than stated from one to the next.
-
-    Raises:
-        SettingsError: If a limit is not above 0.
+    moves nor turns farther than stated from one to the next.  Raises SettingsError if a limit is not above 0.
     """
     if not (spacing_mm > 0.0 and turn_rad > 0.0):
         raise SettingsError(

@@ -27,14 +27,12 @@ class Centreline:
 
     The lumen is the union of round cones along the edges: all balls with a centre on an edge and the radius
     interpolated between its ends.  With `from_lung` and `from_mask` that union is proved to lie in the mask.
+    Raises AnatomyError if there are no edges, or the arrays do not fit together or hold no finite numbers.
 
     Args:
         nodes_mm ((N, 3) float64): LPS mm; for a drawing, z = 0.
         radius_mm: (N,) float64.
         edges ((E, 2) int64): Pairs of nodes that follow each other along a tube.
-
-    Raises:
-        AnatomyError: If there are no edges, or the arrays do not fit together or hold no finite numbers.
     """
 
     nodes_mm: Float
@@ -157,13 +155,10 @@ def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
     """Return the centreline of any branching tube: vein, artery or airway, without a root.
 
     The skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels as
-    solid boxes).
+    solid boxes).  Raises AnatomyError if the mask is empty, or too small for a line.
 
     Args:
         mask: Non-zero inside the tube.
-
-    Raises:
-        AnatomyError: If the mask is empty, or too small for a line.
     """
     from anatomy.tree.lumen import prepare_lumen
     from anatomy.tree.skeleton import prune, spanning_tree, thin

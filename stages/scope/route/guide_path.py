@@ -52,10 +52,8 @@ class GuidePath:
 def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_mm: Float) -> GuidePath:
     """Return the guide path over centreline nodes.
 
-    Start and goal take the place of the nodes nearest to them.
-
-    Raises:
-        SettingsError: If start and goal are the same point.
+    Start and goal take the place of the nodes nearest to them.  Raises SettingsError if start and goal are
+    the same point.
     """
     inner = nodes[1:-1]
     points = np.vstack((start_mm, centreline.nodes_mm[inner], goal_mm))
@@ -98,13 +96,10 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
     """Link each node with its nearest ones, and with those it shares an edge with.
 
     A nearest node counts only if the balls around both overlap: otherwise it may lie behind a wall, in a
-    tube that runs past.
+    tube that runs past.  Raises SettingsError if `neighbours` is less than 1.
 
     Args:
         neighbours: Number of nearest nodes, k of [Li2021].
-
-    Raises:
-        SettingsError: If `neighbours` is less than 1.
     """
     from scipy.spatial import KDTree
 
@@ -127,10 +122,8 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
 def fewest_hops(links: Links, source: int, goal: int) -> Int:
     """Return the nodes from `source` to `goal` with the fewest hops, by the BFS of [Li2021].
 
-    The path with the fewest hops is not always the shortest.
-
-    Raises:
-        NoRouteError: If no chain of links joins them.
+    The path with the fewest hops is not always the shortest.  Raises NoRouteError if no chain of links joins
+    them.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order

@@ -65,14 +65,12 @@ def find_exits(
 
     P1 has the smallest angle, P2 the smallest distance, P3 the smallest weighted sum of both; the paper
     says largest, which would be the worst point.  Where two are the same point, it is listed once.  A lesion
-    whose centre lies in the lumen has one exit, the nearest point.
+    whose centre lies in the lumen has one exit, the nearest point.  Raises TargetError if a lesion has no
+    candidate within reach.
 
     Args:
         lesions_lps: (M, 3) float64, LPS mm.
         accepts: Tree points that it refuses are no candidates.
-
-    Raises:
-        TargetError: If a lesion has no candidate within reach.
     """
     chosen = rule or ExitRule()
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
@@ -405,8 +403,7 @@ MOST_COMBINATIONS = 5_000_000
 def circuits(subtree: Subtree) -> Circuits:
     """Compute the resistances of all combinations of exits.
 
-    Raises:
-        SettingsError: If there are more than 5 million combinations.
+    Raises SettingsError if there are more than 5 million combinations.
     """
     sizes = np.bincount(subtree.exit_lesion, minlength=subtree.n_lesions)
     count = combinations(subtree)

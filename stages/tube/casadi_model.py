@@ -220,9 +220,8 @@ class CasadiTubes:
     def order_at(self, beta_mm: ArrayLike) -> Order:
         """Return the order of the landmarks of tubes whose bases are at arc lengths `(n,)`, at most 0.
 
-        Raises:
-            SettingsError: If a base is ahead of the plate, an end is behind it, a tube ends ahead of one
-                inside it, or numbers are missing or not finite.
+        Raises SettingsError if a base is ahead of the plate, an end is behind it, a tube ends ahead of one
+        inside it, or numbers are missing or not finite.
         """
         beta = self._vector(beta_mm, "beta")
         ends = beta + [tube.length_mm for tube in self._tubes]
@@ -272,11 +271,8 @@ class CasadiTubes:
     ) -> CasadiEquilibrium:
         """Return the equilibrium with base angles `(n,)` that Newton's method finds from guessed tip angles.
 
-        The guess is the base angles if none is given.
-
-        Raises:
-            SettingsError: As `order_at`.
-            ConvergenceError: If the method does not converge from this guess.
+        The guess is the base angles if none is given.  Raises SettingsError as `order_at`, and
+        ConvergenceError if the method does not converge from this guess.
         """
         base, beta = self._vector(base_angles_rad, "base angles"), self._vector(beta_mm, "beta")
         guess = base if guess_rad is None else self._vector(guess_rad, "guess")

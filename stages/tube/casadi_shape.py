@@ -327,10 +327,7 @@ def derive_arrival(
     """Return the frames `(4, 4)` of the tubes' tip without a needle, and of a needle's that has come to it.
 
     With its tip at theirs a needle is one more tube, the innermost and straight.  No tissue holds the tubes.
-
-    Raises:
-        ConvergenceError: If no equilibrium is found.
-        SettingsError: If the insertions are impossible.
+    Raises ConvergenceError if no equilibrium is found, and SettingsError if the insertions are impossible.
     """
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)

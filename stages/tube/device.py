@@ -103,10 +103,8 @@ class Tube:
     """One superelastic tube: straight, with a curved distal part.
 
     The curved part is one arc or, for several curvatures or out of one plane, `bent_pieces`, rearmost first.
-
-    Raises:
-        SettingsError: If a value is not finite or absurd, the tube has no wall, or the curved part
-            contradicts itself.
+    Raises SettingsError if a value is not finite or absurd, the tube has no wall, or the curved part
+    contradicts itself.
     """
 
     outer_diameter_mm: Annotated[float, quantity("outer diameter of the tube", above=0.0, at_most=10.0)]
@@ -237,11 +235,8 @@ class ConcentricTubes:
     The sweep is that of any point of the tubes in tissue during deployment; 90 degrees to the wall is
     perpendicular; the extension counts along the tubes.  In the worst case the working channel bends the tube
     that it holds against its precurvature.  Where no largest curvature of the channel is stated, it is what
-    `max_strain` allows.
-
-    Raises:
-        SettingsError: If a value is not finite or absurd, the tubes do not nest, a tube held straight exceeds
-            `max_strain`, or slots would make the tubes bend otherwise than plain ones.
+    `max_strain` allows.  Raises SettingsError if a value is not finite or absurd, the tubes do not nest, a
+    tube held straight exceeds `max_strain`, or slots would make the tubes bend otherwise than plain ones.
     """
 
     outer: Tube | None = None

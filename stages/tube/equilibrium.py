@@ -170,8 +170,7 @@ class Equilibrium:
     def frames(self, arc_lengths_mm: ArrayLike) -> Float:
         """Return Bishop frames `(N, 4, 4)` at arc lengths `(N,)` from the front plate, straight behind it.
 
-        Raises:
-            SettingsError: If an arc length is not finite or beyond the tip.
+        Raises SettingsError if an arc length is not finite or beyond the tip.
         """
         s = self._arc_lengths(arc_lengths_mm)
         found = matrices(self._along(s)[0])

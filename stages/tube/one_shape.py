@@ -235,9 +235,7 @@ class Neighbourhood:
     ) -> "Neighbourhood":
         """Return that of a deployment reached by the sequence `together`, a needle's tip at that of tubes.
 
-        Raises:
-            SnapError: If the tubes snap on the way.
-            SettingsError: If the insertions are impossible.
+        Raises SnapError if the tubes snap on the way, and SettingsError if the insertions are impossible.
         """
         mechanics = TubeMechanics(tubes, needle=needle)
         turned = np.array(rotations_rad, dtype=np.float64)
@@ -252,8 +250,7 @@ class Neighbourhood:
     def at(self, insertions_mm: ArrayLike, rotations_rad: ArrayLike) -> NearbyShape | None:
         """Return the shape of joint values `(n,)`, reached straight from that deployment; None if tubes snap.
 
-        Raises:
-            SettingsError: If numbers are missing or not finite, or the tubes get out of order.
+        Raises SettingsError if numbers are missing or not finite, or the tubes get out of order.
         """
         mechanics = self._mechanics
         out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))

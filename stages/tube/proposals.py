@@ -45,11 +45,7 @@ class SequenceComparison:
 
     @property
     def best(self) -> DeployedSequence:
-        """The sequence with the least sweep.
-
-        Raises:
-            SettingsError: If none can be carried out.
-        """
+        """The sequence with the least sweep.  Raises SettingsError if none can be carried out."""
         if not self.deployed:
             raise SettingsError(
                 "No sequence reaches this deployment: "
@@ -151,16 +147,13 @@ def propose_designs(
     Varied are the wall of the outer tube, and length and curvature of the inner tube's curved part, within
     the strain limit of `tubes`; the curved part is at least half as long as theirs.  A design is left out if
     another one sweeps no more, reaches no less to the side, turns the tip no more and has no longer curved
-    part.
+    part.  Raises SettingsError if there are not two tubes, the insertions are impossible, the sweep is not
+    finite, or no outer tube fits into the channel.
 
     Args:
         tubes: What to start from; lengths, limits and the inner tube's diameters are kept.
         outer_mm, inner_mm: Insertions of the deployment.
         max_sweep_mm: Designs that sweep more are left out.
-
-    Raises:
-        SettingsError: If there are not two tubes, the insertions are impossible, the sweep is not finite, or
-            no outer tube fits into the channel.
     """
     if tubes.outer is None or tubes.middle is not None:
         raise SettingsError(
@@ -214,8 +207,7 @@ def propose_designs(
 def evaluate_design(tubes: ConcentricTubes, outer_mm: float, inner_mm: float) -> DesignProposal:
     """Return sweep and reach of a design, whose tubes are not turned against each other.
 
-    Raises:
-        SettingsError: If the tubes cannot be inserted so, or snap.
+    Raises SettingsError if the tubes cannot be inserted so, or snap.
     """
     inserted = np.array([inner_mm, outer_mm], dtype=np.float64)
     made = deployed(without_limits(design_arrays(tubes)), inserted, np.zeros(2))

@@ -92,10 +92,8 @@ def kuntz2015(
 ) -> Sequence:
     """Turn, insert both tubes together, insert the inner one alone [Kuntz2015, sec. IV-B].
 
-    Tubes are the inner and the outer one; one rotation in the scope turns both.
-
-    Raises:
-        SettingsError: If there are not two tubes, the outer one would be ahead, or one is too short.
+    Tubes are the inner and the outer one; one rotation in the scope turns both.  Raises SettingsError if
+    there are not two tubes, the outer one would be ahead, or one is too short.
     """
     if len(tubes) != 2:
         raise SettingsError(f"There are {len(tubes)} tubes", expected="two tubes, the inner one first")

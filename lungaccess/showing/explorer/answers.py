@@ -260,8 +260,7 @@ class Answers:
                 else:
                     yield None
         except NoPlan as failure:
-            elapsed_s, point = time.monotonic() - began, target.lps_mm.tolist()
-            yield Part({"answer": "no_plan", "elapsed_s": elapsed_s, "target_lps": point, **_why(failure)})
+            yield Part({"answer": "no_plan", "target_lps": target.lps_mm.tolist(), **_why(failure)})
             return
         if last is None:
             return
@@ -323,7 +322,6 @@ class Answers:
             {
                 "answer": "appraisal", "digest": found.digest, **appraisal.to_mapping(),
                 **appraisal_words(appraisal), "window": window or motion,
-                "findings": len(appraisal.check.findings), "refusals": len(appraisal.check.refusals),
                 "advice": [each.sentence for each in advise(found, self.lung, appraisal, time_s=ADVICE_S)],
             }
         )  # fmt: skip

@@ -73,7 +73,6 @@ def _system(system: System) -> dict[str, Any]:
     needle = system.needle
     return {
         "name": system.name,
-        "description": system.description,
         "scope_diameter_mm": system.scope.outer_diameter_mm,
         "needle_radius_mm": None if needle is None else needle.min_radius_of_curvature_mm,
         "needle_length_mm": None if needle is None else needle.max_length_mm,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -79,26 +80,43 @@ class Asked:
 
 
 @frozen_value
-class Given:
-    """A part of an answer on its way to the page.
+class _Along:
+    """What goes with a part of an answer.
 
     Args:
-        sent: The message.
-        last: Whether the question is answered with it.
         plan: A plan that the page may ask about.
         file: A file that the page may fetch.
         source: The patient that is explored from now on.
         renewed: Whether that is the same patient, of which a person corrected the masks.
     """
 
-    page: str
-    number: int
-    sent: Frame
-    last: bool = False
     plan: KeptPlan | None = None
     file: Path | None = None
     source: PatientSource | None = None
     renewed: bool = False
+
+
+@dataclass(frozen=True)
+class Part(_Along):
+    """A part of an answer, made by what answers."""
+
+    message: dict[str, Any]
+    arrays: dict[str, Any] | None = None
+
+
+@frozen_value
+class Given(_Along):
+    """A part of an answer on its way to the page.
+
+    Args:
+        sent: The message.
+        last: Whether the question is answered with it.
+    """
+
+    page: str
+    number: int
+    sent: Frame
+    last: bool = False
 
 
 @frozen_value
@@ -111,23 +129,6 @@ class Ended:
 
 class Superseded(Exception):  # noqa: N818
     """A later question takes the place of the one that is being answered."""
-
-
-class Part:
-    """A part of an answer, made by what answers: a message, and what goes with it."""
-
-    def __init__(
-        self,
-        message: dict[str, Any],
-        arrays: dict[str, Any] | None = None,
-        *,
-        plan: KeptPlan | None = None,
-        file: Path | None = None,
-        source: PatientSource | None = None,
-        renewed: bool = False,
-    ) -> None:
-        self.message, self.arrays, self.plan, self.file = message, arrays, plan, file
-        self.source, self.renewed = source, renewed
 
 
 class Turn:
@@ -269,20 +270,9 @@ class Worker:
                 self._send(asked, part)
 
     def _send(self, asked: Asked, part: Part, *, last: bool = False) -> None:
-        message = {"id": asked.question.id, **part.message}
-        sent = frame(message, part.arrays)
-        self._connection.send(
-            Given(
-                page=asked.page,
-                number=asked.question.id,
-                sent=sent,
-                last=last,
-                plan=part.plan,
-                file=part.file,
-                source=part.source,
-                renewed=part.renewed,
-            )
-        )
+        number, along = asked.question.id, {each.name: getattr(part, each.name) for each in fields(_Along)}
+        sent = frame({"id": number, **part.message}, part.arrays)
+        self._connection.send(Given(page=asked.page, number=number, sent=sent, last=last, **along))
 
 
 def _failed(asked: Asked, found: str) -> Part:

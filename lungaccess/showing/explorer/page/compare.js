@@ -7,13 +7,13 @@ import { button, fillRows, mm, say } from "./widgets.js";
 
 export class Compared {
   constructor(page) {
-    Object.assign(this, { page, rows: [], hidden: new Set() });
+    Object.assign(this, { page, rows: [] });
     byId("keep").addEventListener("click", () => this.keep());
   }
 
   // The plans that are drawn: all but those that are hidden, and the one that is shown anyway.
   get shown() {
-    return this.rows.filter(({ plan, key }) => plan?.motion && plan !== this.page.plan && !this.hidden.has(key))
+    return this.rows.filter(({ plan, hidden }) => plan?.motion && plan !== this.page.plan && !hidden)
       .map(({ plan: { motion }, number }) => ({ motion, number }));
   }
 
@@ -66,10 +66,10 @@ export class Compared {
     this.page.redraw();
   }
 
-  cells({ key, asked, plan, number, error }) {
-    const { state } = this.page;
-    const box = made("input", { type: "checkbox", checked: !this.hidden.has(key), ariaLabel: `Show plan ${number}`, onchange: () => {
-      this.hidden[box.checked ? "delete" : "add"](key);
+  cells(row) {
+    const { asked, plan, number, error, hidden } = row, { state } = this.page;
+    const box = made("input", { type: "checkbox", checked: !hidden, ariaLabel: `Show plan ${number}`, onchange: () => {
+      row.hidden = !box.checked;
       this.page.redraw();
     } });
     const system = plan ? plan.system : asked.system, from = asked.exit !== null ? ", from an exit" : asked.tip !== null ? ", from a tip" : "";

@@ -421,8 +421,8 @@ class ExplorerPage extends DevicePage {
       exits: exits && { count: exits.count, complete: exits.answer.complete, entries: [...exits.entries] },
       plan: isPlan ? { ...plan, motion: null, appraised: Boolean(plan.appraisal) } : null,
       tip_lps: this.motion ? this.motion.at(this.player.position).tip : null,
-      compared: this.compared.rows.map(({ key, plan: of }) =>
-        ({ digest: of?.digest, appraised: Boolean(of?.appraisal), hidden: this.compared.hidden.has(key) })),
+      compared: this.compared.rows.map(({ plan: of, hidden = false }) =>
+        ({ digest: of?.digest, appraised: Boolean(of?.appraisal), hidden })),
       reach: reach && { share: reach.share, system: reach.grid.system },
       finer: Object.fromEntries(Object.entries(this.slices ?? {}).map(([name, slice]) => [name, slice.isFine])),
       place: this.placeFound ?? null, points: Object.fromEntries([...scene?.points ?? []].map(([key, { count }]) => [key, count])),

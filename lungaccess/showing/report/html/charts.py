@@ -55,7 +55,7 @@ def figure(
     kind: str, title: str, names: tuple[str, str], lines: Sequence[Line], *, more: str = "", **options: Any
 ) -> str:
     """Return a figure with one chart, `more` as HTML behind its title, and the options of `line_chart`."""
-    return _figure(kind, title + more, line_chart(title, names, lines, **options))
+    return _figure(kind, words.text(title) + more, line_chart(title, names, lines, **options))
 
 
 def _figure(kind: str, caption: str, content: str) -> str:

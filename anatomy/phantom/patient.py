@@ -152,7 +152,9 @@ def make_phantom(
     )
 
 
-def _require_settings(seed: int, spacing_mm: float | None, size: str, noise_hu: float) -> tuple[float, float]:
+def _require_settings(
+    seed: object, spacing_mm: float | None, size: str, noise_hu: float
+) -> tuple[float, float]:
     if size not in SCALES:
         raise SettingsError(f"The phantom size is {size!r}", expected=f"one of {', '.join(SCALES)}")
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:

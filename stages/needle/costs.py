@@ -125,7 +125,6 @@ def _crossings(grid: Grid, path: ArcPath) -> tuple[Int, Float]:
 
 
 def _costs_of(cost_map: Volume, voxels: Int) -> Float:
-    """Return the costs of voxels by their numbers, infinite beyond the grid."""
     inside = voxels != kernel.OFF_GRID
     costs = np.full(len(voxels), math.inf)
     costs[inside] = cost_map.array.ravel(order="F")[voxels[inside]]

@@ -76,17 +76,11 @@ def environment_of_labels(
     goal_tolerance_mm: float = 0.0,
     cost_map: Volume | None = None,
 ) -> NeedleEnvironment:
-    """Gather the same from a label volume alone.
+    """Gather the same from a label volume `(ni, nj, nk)` uint16 alone, see `anatomy.structures`.
 
-    Args:
-        labels ((ni, nj, nk) uint16): See `anatomy.structures`.
-        bits: Structures that are obstacles.
-        required_clearance_mm: Distance that the needle's axis keeps from obstacles.
-        obstacles_as: `SOLID`: the clearance is measured to voxels as solid boxes, and the outermost voxels
-            count as OUTSIDE, since what lies beyond the grid is not known; `CENTRES`: to voxel centres, and
-            the axis alone stays in the grid.
-        goal_tolerance_mm: How far from the target a path may end.
-        cost_map: On `grid`.
+    With `obstacles_as` SOLID the clearance is measured to voxels as solid boxes, and the outermost voxels
+    count as OUTSIDE, since what lies beyond the grid is not known; with CENTRES it is measured to voxel
+    centres, and the axis alone stays in the grid.  The cost map lies on `grid`.
 
     Raises:
         GridMismatchError: If labels or cost map do not fit the grid.
@@ -112,14 +106,10 @@ def environment_of_labels(
 def begun_at_wall(
     environment: NeedleEnvironment, point: ArrayLike, branches: tuple[int, ...]
 ) -> NeedleEnvironment:
-    """Return an environment for a needle that begins at the wall of a branch and pierces it itself.
+    """Return an environment for a needle that begins at a point `(3,)` LPS mm at a wall and pierces it.
 
-    See `stages.needle.kernels.proof.exact_gap` for the rule, which is that of all searches and proofs.
-
-    Args:
-        point ((3,) float64, LPS mm): Where the needle begins.
-        branches: The pierced branch and those that are pierced with it: their airway counts as that of the
-            first, as far as the exemption reaches.
+    The rule of `stages.needle.kernels.proof.exact_gap` is that of all searches and proofs.  The airways of
+    all `branches`, the pierced one first, count as that of the first, as far as the exemption reaches.
     """
     # A needle that pierces the wall itself leaves it at this angle at least: the least of the presets' tubes.
     limits = environment.limits._replace(leaving_sine=math.sin(math.radians(10.0)))
@@ -201,18 +191,15 @@ def direct_arcs(
     branches: Int,
     target: ArrayLike,
 ) -> tuple[Int, Float, Float]:
-    """Try the single arc to a target from each start pose.
+    """Try the single arc to a target `(3,)` from each start pose: positions and tangents `(E, 3)`, LPS mm.
 
-    Args:
-        positions, tangents: (E, 3) float64, LPS mm.
-        branches ((E,) int64): Branch whose wall each start has pierced; -1 for none.
-        target: (3,) float64, LPS mm.
+    `branches` `(E,)` are those whose walls the starts have pierced; -1 for none.
 
     Returns:
         - blockers ((E,) int64) - 0 where the arc is proved clear, -1 where no arc fits the limits, else the
-          label of the voxel that is too near.
+            label of the voxel that is too near.
         - lengths, inverse_clearance ((E,) float64) - Length in mm, and the estimated integral of 1 /
-          clearance where the arc is clear.
+            clearance where the arc is clear.
     """
     blockers = np.zeros(len(branches), dtype=np.int64)
     costs = np.zeros((len(branches), 2))

@@ -116,10 +116,9 @@ class Objective:
     def of(cls, stated: str | Objective) -> Objective:
         """Return the objective that a text states, or the objective itself.
 
-        Args:
-            stated: The names of costs, each with its weight after "=", separated by commas.  A cost is named
-                by its key (``length_mm``) or as on the command line (``length``); a name alone has the weight
-                1.  "default" is ``inverse_clearance=1,cost_map=1``.
+        The text names costs, each with its weight after "=", separated by commas.  A cost is named by its key
+        (``length_mm``) or as on the command line (``length``); a name alone has the weight 1.  "default" is
+        ``inverse_clearance=1,cost_map=1``.
 
         Raises:
             SettingsError: If there is no such cost, one is named twice, or a weight is not a number of 0 or
@@ -201,14 +200,10 @@ class Objective:
     def arrays(self, cost_map: Float32 | None, width_mm: float) -> ObjectiveArrays:
         """Return the weights and the map for the kernels, see `stages.needle.kernels.cost`.
 
-        They are those of a needle, whose width is the same everywhere.  The least cost of a mm is a proved
-        lower bound.  The voxel sum adds nothing to it: however small the cost, an arc can be so short that
-        it enters no other voxel.  Raises SettingsError if the objective weighs a map, and there is none, or
-        one with negative costs, NaN, or no finite cost.
-
-        Args:
-            cost_map ((ni, nj, nk) float32 or None): Not negative; infinite is an obstacle.
-            width_mm: Outer diameter of the needle.
+        They are those of a needle, which is `width_mm` wide everywhere; an infinite cost is an obstacle.  The
+        least cost of a mm is a proved lower bound.  The voxel sum adds nothing to it: however small the cost,
+        an arc can be so short that it enters no other voxel.  Raises SettingsError if the objective weighs a
+        map, and there is none, or one with negative costs, NaN, or no finite cost.
         """
         if self.weighs_map and cost_map is None:
             raise SettingsError(
@@ -264,7 +259,6 @@ def _arrays(
 
 
 def _term(name: str) -> Term:
-    """Return the cost of a name."""
     if name in _BY_NAME:
         return _BY_NAME[name]
     options = [term.option for term in TERMS]

@@ -94,11 +94,10 @@ class ReachScan:
         self._objective = environment.objective_arrays(Objective(length=0.0, inverse_clearance=1.0))
 
     def reach(self, points: ArrayLike, seeds: UInt64, near: Int | None = None) -> Reached:
-        """Try all points, cube by cube of `BLOCK_MM`: what neighbours have in common is found once.
+        """Try all points `(N, 3)` LPS mm, cube by cube: what neighbours have in common is found once.
 
-        Args:
-            points, seeds ((N, 3) float64, (N,) uint64): LPS mm; seed of the search to each point.
-            near ((N, K) int64): Indices of points near each, -1 for none; by default the one before.
+        `seeds` `(N,)` are those of the search to each point; `near` `(N, K)` are indices of points near each,
+        -1 for none, by default the one before.
         """
         places = np.array(points, dtype=np.float64, order="C").reshape(-1, 3)
         kinds, found = np.zeros(len(places), dtype=np.int64), np.zeros((len(places), 2))

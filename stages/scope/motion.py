@@ -87,12 +87,7 @@ class ScopeMotion:
         return read_only(np.array(tips))
 
     def between(self, advance_mm: float, turn_rad: float) -> "ScopeMotion":
-        """Return the same motion with states put between, so that none differs more from the one before it.
-
-        Args:
-            advance_mm: Largest advance from one state to the next.
-            turn_rad: Largest change of twist or bend.
-        """
+        """Return the same motion with states put between, at most so much advance and turn apart."""
         shares = np.abs(np.diff(self.states, axis=0)) / [advance_mm, turn_rad, turn_rad]
         states = [self.states[:1]]
         for before, after, most in zip(self.states[:-1], self.states[1:], shares.max(axis=1), strict=True):

@@ -64,12 +64,9 @@ class MotionProver:
         """Prove a motion: return its margin in mm, or say in words why there is no proof.
 
         The margin is a lower bound on the distance between the scope's surface and the wall of the lumen,
-        beyond the gap that the scope keeps, over all places of the body during the whole motion.  Near
-        the wall the bound is about 0.1 mm too low at most.
-
-        Args:
-            turn_mm, step_mm: Longest parts of changes in place and longest steps along the body: longer ones
-                prove less.
+        beyond the gap that the scope keeps, over all places of the body during the whole motion.  Near the
+        wall the bound is about 0.1 mm too low at most.  Longer parts of changes in place, `turn_mm`, and
+        longer steps along the body, `step_mm`, prove less.
         """
         wrong = broken_limit(self._scope, motion)
         if wrong:
@@ -87,11 +84,9 @@ class MotionProver:
     def tolerances(self, motion: ScopeMotion) -> Float:
         """Return by how much advance in mm, twist and bend in rad may err in each step `(M - 1, 3)`.
 
-        If one of the three errs by no more than this anywhere in a step, and all else is as stated, the scope
-        with its gap stays in the lumen during the step.  Larger values may be possible, smaller ones are.
-
-        Args:
-            motion: A proved one of M states.
+        If one of the three errs by no more than this anywhere in a step of a proved motion, and all else is
+        as stated, the scope with its gap stays in the lumen during it.  Larger values may be possible,
+        smaller ones are.
         """
         out = np.zeros((len(motion.states) - 1, 3))
         section_mm = self._scope.bending_length_mm
@@ -106,11 +101,8 @@ class MotionProver:
     ) -> ScopeMotion:
         """Return a proved motion of fewer changes and twists to the same tip, the given one if none is found.
 
-        Args:
-            motion: A proved one.
-            max_curvature_per_mm: Largest curvature of the body that the tubes in its channel can stand.
-            end_bends_rad ((float, float)): Bends farthest down and up of the section at the tip, where tubes
-                in it take some.
+        The tubes in the channel stand `max_curvature_per_mm` of the body; `end_bends_rad` are the bends
+        farthest down and up of the section at the tip, where tubes in it take some.
         """
         room = self.prove(motion)
         if isinstance(room, str):

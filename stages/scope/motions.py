@@ -148,12 +148,9 @@ def _where_too_narrow(
 
 @frozen_record
 class ScopeTip:
-    """A pose of the scope's tip, and the motion that brings the device there.
+    """A pose of the scope's tip, the tree point nearest to it, and the motion that brings the device there.
 
-    Args:
-        lps_from_scope_tip ((4, 4) float64): Frame of the working channel: +z is forward, rotations of the
-            tubes count from +x.
-        tree_point: Nearest point of the airway tree.
+    The pose is the frame of the working channel: +z is forward, rotations of the tubes count from +x.
     """
 
     motion: ScopeMotion
@@ -253,14 +250,11 @@ def find_motions(
     tip_bends_rad: tuple[float, float] | None = None,
     spacing_mm: float = 1.0,
 ) -> ScopeMotions:
-    """Find scope tips from which tubes can leave the airway, each with a proved motion of the scope.
+    """Find scope tips from which tubes can leave the airway at most `reach_mm` ahead, with proved motions.
 
-    Args:
-        reach_mm: How far ahead of the scope tip the airway may be left.
-        max_curvature_per_mm: Largest curvature of the body that the tubes in its channel can stand.
-        tip_bends_rad ((float, float)): Bends farthest down and up of the section at the tip, where tubes in
-            it take some; those of the scope by default.
-        spacing_mm: Distance between tips along a branch; those turned aside are twice as far apart.
+    The tubes in the channel stand `max_curvature_per_mm` of the body; `tip_bends_rad` are the bends farthest
+    down and up of the section at the tip, by default those of the scope, where tubes take some of them.  Tips
+    along a branch are `spacing_mm` apart; those turned aside are twice as far apart.
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
     walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
@@ -319,14 +313,8 @@ def find_tips(
 ) -> tuple[Float, Int, int]:
     """Return tips that are proved reachable in place from states, their tree points, and how many look ahead.
 
-    Args:
-        wanted ((N,) bool): Tree points at which tips are wanted.
-
-    Returns:
-        - tips ((S, 15) float64) - See `stages.scope.kernels.turning`; those that look ahead on the axis come
-          first.
-        - tree_point ((S,) int64)
-        - ahead
+    The tips `(S, 15)`, see `stages.scope.kernels.turning`, are at the tree points `(N,)` where they are
+    wanted; those that look ahead on the axis come first.
     """
     places, ahead, count = _places(tree, wanted, spacing_mm)
     from_states = states.states[states.turned_from]

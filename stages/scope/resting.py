@@ -123,10 +123,9 @@ class RestingShaft:
     ) -> RestingShape:
         """Return the shape of the shaft at rest in the last state of a motion.
 
-        Args:
-            start: What to begin from, of a motion of the same length; by default the shape as it was laid.
-            as_advanced: Leave the advance as planned; by default the hand advances more or less until the tip
-                has the planned depth, which cameras and trackers show.
+        It begins from `start`, a shape of a motion of the same length, or as it was laid.  Unless it stays
+        `as_advanced`, the hand advances more or less until the tip has the planned depth, which cameras and
+        trackers show.
         """
         planned, entry = motion.lps_from_tip, frame_columns(motion.lps_from_entry)
         shaft, curvature = self._shaft(motion, chosen)

@@ -252,7 +252,6 @@ class Simplifier:
         return None if orders is None else replace(found, orders=orders)
 
     def _bounds(self, legs: Legs) -> Float:
-        """Return the least and most of each unknown `(n, 2)`."""
         bends = [self._laid] * len(legs.bends)
         bends[-1] = self._end
         if len(legs.bends) == legs.count:

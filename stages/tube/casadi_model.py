@@ -58,12 +58,10 @@ class Order:
 
 @frozen_record
 class CasadiEquilibrium:
-    """One equilibrium of the tubes.
+    """One equilibrium of the tubes: angles `(n,)` at their own ends and at their bases.
 
-    Args:
-        tip_angles_rad, base_angles_rad ((n,) float64): Angle of each tube at its own end, and at its base.
-        base_from_tip ((4, 4) float64): Material frame of the innermost tube at its end.
-        determinant: Determinant of the derivative of the base angles by the tip angles.
+    `base_from_tip` `(4, 4)` is the material frame of the innermost tube at its end, `determinant` that of the
+    derivative of the base angles by the tip angles.
     """
 
     tip_angles_rad: Float
@@ -73,14 +71,11 @@ class CasadiEquilibrium:
 
 
 class OrderedTubes:
-    """The functions of tubes whose landmarks keep one order.
+    """The functions of n tubes, the innermost first, whose landmarks keep one order.
 
     All are `casadi.Function`, made when first asked for, and can be called with numbers or with symbols.
-    Vectors are columns.  Where the landmarks have another order the results mean nothing.
-
-    Args:
-        tubes: n >= 1 tubes, innermost first.
-        steps_per_piece: Runge-Kutta steps between two landmarks.  The error falls with the fourth power.
+    Vectors are columns.  Where the landmarks have another order the results mean nothing.  The error falls
+    with the fourth power of `steps_per_piece`, the Runge-Kutta steps between two landmarks.
     """
 
     def __init__(self, tubes: Sequence[Tube], order: Order, *, steps_per_piece: int) -> None:
@@ -198,11 +193,7 @@ class OrderedTubes:
 
 
 class CasadiTubes:
-    """The mechanics of n >= 1 concentric tubes, whatever the order of their landmarks.
-
-    Args:
-        tubes: Innermost, and so longest, first.
-        steps_per_piece: Runge-Kutta steps between two landmarks.
+    """The mechanics of concentric tubes, the innermost, longest first, whatever the order of their landmarks.
 
     Raises:
         SettingsError: If there is no tube or no step.

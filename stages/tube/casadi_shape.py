@@ -49,13 +49,10 @@ POSITION, ROTATION, FORCE, MOMENT, FIRST_ANGLE = slice(0, 3), slice(3, 7), slice
 
 @frozen_record
 class LoadedShape:
-    """Tubes with a needle in them, in the frame of the front plate.
+    """Tubes with a needle in them, in the frame of the front plate: N points `(N, 3)` up to the tubes' tip.
 
-    Args:
-        arc_lengths_mm ((N,) float64): From the front plate to the tubes' tip.
-        points_mm: (N, 3) float64.
-        base_from_tip ((4, 4) float64): Frame of the tubes' tip, carried along without turning.
-        tip_angles_rad ((n,) float64): Angle of each tube at its own end.
+    The frame `(4, 4)` of the tip is carried along without turning; `tip_angles_rad` (n,) are those of each
+    tube at its own end.
     """
 
     arc_lengths_mm: Float
@@ -76,13 +73,10 @@ def derive_loaded(
 ) -> LoadedShape:
     """Return the shape of tubes that stood in tissue without a needle, when its tip is at `needle_mm`.
 
-    Args:
-        tubes: The innermost first.
-        needle: Straight.
-        base_angles_rad, beta_mm ((n,) float64): See `stages.tube.mechanics.TubeMechanics`.
-        needle_mm: Arc length of the needle's tip from the front plate.
-        tissue_n_mm2, tissue_from_mm: Force for each mm of tube and mm aside, beyond an arc length.  Far
-            stiffer tissue than lungs makes the problem too steep.
+    Tubes are listed from the innermost, their joints `(n,)` are those of
+    `stages.tube.mechanics.TubeMechanics`; the needle is straight, and its tip counts along the tubes from the
+    front plate.  Tissue presses with `tissue_n_mm2` for each mm of tube and mm aside, beyond the arc length
+    `tissue_from_mm`; one far stiffer than lungs makes the problem too steep.
 
     Raises:
         ConvergenceError: If no shape is found.
@@ -278,11 +272,8 @@ def derive_shape(
 ) -> DerivedShape:
     """Follow the tubes to a deployment by the sequence `together`, with the CasADi model.
 
-    Args:
-        tubes: The innermost first.
-        rotations_rad, insertions_mm ((n,) float64): As in `stages.tube.shapes.TubeShapes`.
-        needle: Straight; its tip stays where that of the innermost tube is, so it is one more tube, the
-            innermost.
+    Tubes are listed from the innermost, their joints `(n,)` are those of `stages.tube.shapes.TubeShapes`.  A
+    straight needle's tip stays where that of the innermost tube is, so it is one more tube, the innermost.
 
     Raises:
         ConvergenceError: If the tubes snap on the way: their equilibrium loses stability or jumps.

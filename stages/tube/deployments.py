@@ -163,15 +163,13 @@ class SiteEnumerator:
     A stretch that many shapes share is followed once; where it is refused, so are all of them.  What a shape
     sweeps, and what its arcs and the sharing are off by, is added to its clearance.  The arc length at the
     exit, the angle and the run there are those of the shape that shares the beginning, which is within the
-    tolerance of the tree.
+    tolerance of the tree.  `angles` `(T,)` are the rotations in rad: the even ones, then those between them,
+    if there are any.
 
     Args:
         enough: Where more deployments are of use, fewer rotations are looked at.
         at_stops: Numbers, set and tree of the shapes that are placed; `coarser_shapes` of the design's if
             None.
-
-    Attributes:
-        angles ((T,) float64): Rotations, rad: the even ones, then those between them, if there are any.
     """
 
     def __init__(
@@ -273,7 +271,6 @@ class SiteEnumerator:
 
 
 def _about_z(angles_rad: Float) -> Float:
-    """Return rotations about +z `(T, 4, 4)`."""
     turned = np.zeros((len(angles_rad), 4, 4))
     turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angles_rad)
     turned[:, 1, 0] = np.sin(angles_rad)

@@ -183,7 +183,6 @@ def _limits(tubes: ConcentricTubes) -> ShapeLimits:
 def _design(
     tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid, needle: Tube | None
 ) -> dict[str, Any]:
-    """Return what the shapes of a design depend on."""
     return {
         "tubes": [to_mapping(tube) for tube in tubes],
         "limits": to_mapping(limits),

@@ -88,9 +88,7 @@ def _stretches(tube: Tube) -> Iterator[tuple[float, ...]]:
 def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0) -> None:
     """Check that tubes, the innermost first, fit into each other and that none is longer than one inside.
 
-    Args:
-        least_clearance_mm: Least difference of diameters, which must be more than 0 in any case; None: any
-            will do.
+    Their diameters differ by more than 0 and at least by the clearance, or by anything if that is None.
 
     Raises:
         SettingsError: If there is none, or they do not nest.

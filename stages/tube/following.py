@@ -94,13 +94,10 @@ def deploy(
     step_mm: float = DEFAULT_STEP_MM,
     step_rad: float = DEFAULT_STEP_RAD,
 ) -> DeployedSequence:
-    """Follow the equilibrium of the tubes through a sequence [Kuntz2015].
+    """Follow the equilibrium of the tubes through a sequence [Kuntz2015], by steps that are no larger.
 
     Each step is solved from the tip angles of the one before.  A step is accepted if its equilibrium is
     stable, near the one before and, solved backwards, leads to it; otherwise the step is halved.
-
-    Args:
-        step_mm, step_rad: Largest motion of any joint between two steps.
 
     Raises:
         SnapError: If the tubes snap during the motion.

@@ -19,14 +19,10 @@ from stages.tube.kernels import equilibrium
 
 @frozen_record
 class Batch:
-    """Equilibria of M configurations of n tubes.
+    """Equilibria of M configurations of n tubes: their tip angles `(M, n)`, and what else is known `(M,)`.
 
-    Args:
-        tip_angles_rad: (M, n) float64.
-        base_from_tip ((M, 4, 4) float64): Tip frame of the innermost tube's material.
-        converged, stable: (M,) bool.
-        least_determinant ((M,) float64): See `Equilibrium.determinant`.
-        residual_rad ((M,) float64): Largest error of a rear end's angle.
+    The tip frame `(M, 4, 4)` is that of the innermost tube's material; `residual_rad` is the largest error of
+    a rear end's angle; see `Equilibrium.determinant` for the least determinant.
     """
 
     tip_angles_rad: Float
@@ -58,14 +54,11 @@ class TubeMechanics(NestedTubes):
     def given_tip_angles(
         self, tip_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: float | None = None
     ) -> Equilibrium:
-        """Return the equilibrium with given rotations of the tubes' own ends: it always exists.
+        """Return the equilibrium with given rotations `(n,)` of the tubes' own ends: it always exists.
 
-        Args:
-            tip_angles_rad ((n,) float64): Rotation of each tube's material at its end against the Bishop
-                frame, not wrapped.
-            beta_mm ((n,) float64): Where the rear ends are: 0 at the front plate, negative behind it.
-            needle_mm: Where the needle's tip is: at 0 or behind it changes nothing.  By default it is where
-                that of the innermost tube is.
+        The rotations are those of the material against the Bishop frame, not wrapped; `beta_mm` `(n,)` tells
+        where the rear ends are: 0 at the front plate, negative behind it.  The needle's tip is where that of
+        the innermost tube is if None; at 0 or behind it changes nothing.
 
         Raises:
             SettingsError: If numbers are missing or not finite, or `check_shifts` refuses them.
@@ -81,18 +74,12 @@ class TubeMechanics(NestedTubes):
         needle_mm: float | None = None,
         guess_rad: ArrayLike | None = None,
     ) -> Equilibrium:
-        """Return an equilibrium with given rotations of the rear ends.
+        """Return an equilibrium with given rotations `(n,)` of the rear ends; see `given_tip_angles`.
 
-        From the guess Newton's method is tried; if it fails or ends at an unstable equilibrium, the
-        precurvature is raised from nothing, and then guesses all round are tried.  So what is returned is
+        They are not wrapped: a full turn between tubes is another state.  From the guess of the tip angles,
+        by default the base angles, Newton's method is tried; if it fails or ends at an unstable equilibrium,
+        the precurvature is raised from nothing, and then guesses all round are tried.  So what is returned is
         unstable only if no stable equilibrium was found.
-
-        Args:
-            base_angles_rad ((n,) float64): Not wrapped: a full turn between tubes is another state.
-            beta_mm: (n,) float64.
-            needle_mm: See `given_tip_angles`.
-            guess_rad ((n,) float64): Tip angles to start from, such as those of a configuration nearby; by
-                default the base angles.
 
         Raises:
             ConvergenceError: If no equilibrium is found.
@@ -116,11 +103,7 @@ class TubeMechanics(NestedTubes):
     def batch(
         self, base_angles_rad: ArrayLike, beta_mm: ArrayLike, *, needle_mm: ArrayLike | None = None
     ) -> Batch:
-        """Return the equilibria of many configurations; see `given_base_angles`.
-
-        Args:
-            base_angles_rad, beta_mm: (M, n) float64.
-            needle_mm (float or (M,) float64): See `given_tip_angles`.
+        """Return the equilibria of M configurations `(M, n)`; see `given_base_angles`.
 
         Raises:
             SettingsError: See `given_tip_angles`.  What does not converge is marked, not raised.

@@ -285,6 +285,5 @@ class Neighbourhood:
         )
 
     def _rear_ends(self, insertions_mm: Float) -> Float:
-        """Return the rear ends `(b,)` of tubes and needle, mm."""
         beta = (insertions_mm - self._mechanics.lengths_mm)[None]
         return np.array(self._mechanics.rear_ends(beta, insertions_mm[:1])[0])

@@ -33,12 +33,7 @@ ROUNDING = 1e-12
 
 @frozen_record
 class SequenceComparison:
-    """Sequences to one final place, by their sweep.
-
-    Args:
-        deployed: Those that can be carried out, least sweep first.
-        refused: Why the others cannot: a tube is too short, or the tubes would snap.
-    """
+    """Sequences to one final place that can be carried out, least sweep first, and why the others cannot."""
 
     deployed: tuple[DeployedSequence, ...]
     refused: dict[str, str]
@@ -127,10 +122,8 @@ class MakerLimits:
 class DesignProposal:
     """A pair of tubes, and what one deployment of it does, both tubes first, then the inner one alone.
 
-    Args:
-        lateral_sweep_mm: Largest distance of any point of the body from its final place.
-        tip_offset_mm: Distance of the tip from the scope's axis: the sideways reach.
-        tip_angle_rad: Angle between tip and scope.
+    The sweep is the largest distance of any point of the body from its final place, the offset the distance
+    of the tip from the scope's axis, the angle that between tip and scope.
     """
 
     tubes: ConcentricTubes
@@ -142,18 +135,14 @@ class DesignProposal:
 def propose_designs(
     tubes: ConcentricTubes, outer_mm: float, inner_mm: float, max_sweep_mm: float, limits: MakerLimits
 ) -> tuple[DesignProposal, ...]:
-    """Vary what a maker can vary, and return the designs worth a look, least sweep first.
+    """Vary what a maker can vary, and return the designs that sweep little enough, least sweep first.
 
     Varied are the wall of the outer tube, and length and curvature of the inner tube's curved part, within
-    the strain limit of `tubes`; the curved part is at least half as long as theirs.  A design is left out if
-    another one sweeps no more, reaches no less to the side, turns the tip no more and has no longer curved
-    part.  Raises SettingsError if there are not two tubes, the insertions are impossible, the sweep is not
-    finite, or no outer tube fits into the channel.
-
-    Args:
-        tubes: What to start from; lengths, limits and the inner tube's diameters are kept.
-        outer_mm, inner_mm: Insertions of the deployment.
-        max_sweep_mm: Designs that sweep more are left out.
+    the strain limit of `tubes`, whose lengths, limits and inner diameters are kept; the curved part is at
+    least half as long as theirs.  A design is left out if another one sweeps no more at these insertions,
+    reaches no less to the side, turns the tip no more and has no longer curved part.  Raises SettingsError if
+    there are not two tubes, the insertions are impossible, the sweep is not finite, or no outer tube fits
+    into the channel.
     """
     if tubes.outer is None or tubes.middle is not None:
         raise SettingsError(

@@ -73,10 +73,8 @@ def together(
 ) -> Sequence:
     """Turn in the scope, insert all tubes with flush tips; each stops at its own insertion.
 
-    Args:
-        tubes: n tubes, innermost first.
-        base_angles_rad (float or (n,) float64): Rotation of the bases; one number turns all of them.
-        insertions_mm ((n,) float64): How far each tube's tip comes out of the scope.
+    Tubes are n, the innermost first; the bases are turned by angles `(n,)`, or all by one; `insertions_mm`
+    `(n,)` tells how far each tip comes out of the scope.
 
     Raises:
         SettingsError: If an outer tube would be ahead of an inner one, or a tube is too short.
@@ -152,12 +150,9 @@ def joint_steps(
 ) -> tuple[Float, Float, np.ndarray]:
     """Cut a sequence into steps, also where a curved part leaves the scope or the next tube.
 
-    Args:
-        step_mm, step_rad: Largest motion of any joint in one step.
-
-    Returns:
-        - base_angles_rad, beta_mm ((K, n) float64)
-        - move ((K,) int64) - Index into `sequence.moves`; 0 for the first step, which is the first waypoint.
+    No joint moves more in a step than stated.  Returned are base angles and arc lengths of bases `(K, n)`,
+    and the move of each step `(K,)`, an index into `sequence.moves`; the first step, of move 0, is the first
+    waypoint.
 
     Raises:
         SettingsError: If a step is not above 0, the tubes are others, or they get out of order during the
@@ -213,7 +208,6 @@ def _crossings(landmarks: list[tuple[int, float]], a: Float, b: Float) -> Float:
 
 
 def _insert(tubes: collections.abc.Sequence[Tube], moving: np.ndarray) -> str:
-    """Return the words for inserting some of the tubes."""
     if moving.all():
         return "insert the tube" if len(tubes) == 1 else "insert all tubes"
     if len(tubes) == 2:

@@ -160,10 +160,8 @@ def tube_shapes(
 ) -> TubeShapes:
     """Return all deployments of a design that follow a stable branch of equilibria and keep its limits.
 
-    Args:
-        tubes: One, two or three, the innermost first.
-        grid: `ShapeGrid.default` if None.
-        needle: A straight needle whose tip stays where that of the innermost tube is.
+    A straight needle's tip stays where that of the innermost tube is; the grid is `ShapeGrid.default` if
+    None.
 
     Raises:
         SettingsError: If there are more than three tubes, they do not nest, or slots make them other than
@@ -248,7 +246,6 @@ def _free_rotations(tubes: Sequence[Tube]) -> int:
 
 
 def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
-    """Return the number of stops up to the longest insertion."""
     return max(round(longest_mm / grid.stop_mm), 1)
 
 

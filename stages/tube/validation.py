@@ -91,12 +91,8 @@ class DeploymentValidator:
     ) -> Deployment | str:
         """Return the deployment of any joint values, or the reason why it is refused.
 
-        Args:
-            lps_from_scope_tip: (4, 4) float64.
-            rotation_rad: Direction of the bend about +z of the scope tip, counted from its +x.
-            insertions_mm ((n,) float64): Insertion of each tube beyond the scope tip, the outermost first.
-            rotations_rad ((n,) float64): How much farther the rear end of each is turned, the outermost
-                first; nothing if None.
+        The rotation counts about +z of the scope tip, from its +x.  Insertions beyond the scope tip, and how
+        much farther the rear ends are turned (nothing if None), are `(n,)`, the outermost tube first.
 
         Raises:
             SettingsError: If a tube would be ahead of one inside it, or numbers are missing or not finite.
@@ -121,12 +117,9 @@ class DeploymentValidator:
     def validate_shape(
         self, lps_from_scope_tip: Float, rotation_rad: float, shape: TubeShape
     ) -> Deployment | str:
-        """Return the deployment of a shape of the design, or the reason why it is refused.
+        """Return the deployment of a shape of the design, or the reason why it is refused; see `validate`.
 
-        Args:
-            lps_from_scope_tip: (4, 4) float64.
-            rotation_rad: Of all tubes together about +z of the scope tip, counted from its +x.
-            shape: Its own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
+        The shape's own limits (extension, sweep, strain, snaps) are kept by all members of `TubeShapes`.
         """
         base = np.concatenate([lps_from_scope_tip[:3, 3], lps_from_scope_tip[:3, 2]])
         normal = np.asarray(frames.bending_directions(lps_from_scope_tip, rotation_rad)[0])

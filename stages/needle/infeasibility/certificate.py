@@ -330,7 +330,6 @@ class NoPathProof:
         return least, most
 
     def _require(self, size: int) -> None:
-        """Raise if so many bytes more do not fit the memory allowed."""
         used = sum(plane.bits.nbytes for plane in self._planes + self._coarse)
         if used + size > self._max_bytes:
             raise _TooMuchError

@@ -62,14 +62,10 @@ class Plane:
         return np.asarray(np.argwhere(cells) + self.window[2:], dtype=np.int64)
 
     def probed_cells(self, moves: Float) -> tuple[Int, Int]:
-        """Return which cells of position the tangents of the states can meet at some depths.
+        """Return the first cells (y, x) that the tangents meet at D depths, and how many: `(D, 2)` each.
 
-        Args:
-            moves ((D,) float64): Cells of position by which a tangent moves up to each depth, for each cell
-                of direction.
-
-        Returns:
-            corners, shape ((D, 2) int64): Numbers (y, x) of the first cells, and how many there are.
+        `moves` `(D,)` are the cells of position by which a tangent moves up to each depth, for each cell of
+        direction.
         """
         low, high = self.window, self.ends
         corners = np.zeros((len(moves), 2), dtype=np.int64)
@@ -99,12 +95,9 @@ class PathBounds:
 
     @classmethod
     def of(cls, total_mm: float, tolerance_mm: float, kappa: float, length_mm: float) -> "PathBounds":
-        """Return the bounds for a target `total_mm` from the start.
+        """Return the bounds for a target `total_mm` away, of which paths may end `tolerance_mm` off.
 
-        Args:
-            total_mm, tolerance_mm: Distance from start to target, and how far from the target a path may end.
-            kappa: Greatest curvature, 1/mm.
-            length_mm: Greatest length of a path.
+        `kappa` is the greatest curvature in 1/mm, `length_mm` the greatest length of a path.
         """
         radius, widest = 1.0 / kappa, total_mm + tolerance_mm
         ends = np.zeros(bounds.ENDS_SIZE)
@@ -178,12 +171,8 @@ def tightest(
 ) -> Passage | None:
     """Return the plane on which the states are narrowest for where it lies; None if all are near an end.
 
-    Args:
-        depth_mm: Distance of the planes.
-        paths: Where paths can be without obstacles.
-        kappa: Greatest curvature, 1/mm.
-        line (tuple of arrays): The start (3,), what a mm of depth moves the first cell (3,), and the axes of
-            cells (2, 3), LPS mm.
+    The planes are `depth_mm` apart; `paths` tells where paths can be without obstacles; `line` holds the
+    start (3,), what a mm of depth moves the first cell (3,), and the axes of cells (2, 3), LPS mm.
     """
     least, found = math.inf, None
     for number, plane in enumerate(planes):
@@ -215,13 +204,9 @@ def backward_reach(
     """Return from which directions paths of a needle may come to a target, at every distance from it.
 
     What is left out holds no point of a path that keeps its clearance from there to the target.  A needle
-    that is longer than half a circle of its least radius may come from everywhere.
-
-    Args:
-        target_lps ((3,) float64): LPS mm.
-        middle ((3,) float64): Direction from the target to where needles start; directions far from it are
-            not looked at.
-        cell: Side of a cell of the plane of directions, half an angle in rad.
+    that is longer than half a circle of its least radius may come from everywhere.  Directions far from
+    `middle`, which leads from the target to where needles start, are not looked at; `cell` is the side of a
+    cell of the plane of directions, half an angle in rad.
     """
     limits = environment.limits
     if limits.max_length_mm * limits.kappa > math.pi:

@@ -177,12 +177,9 @@ class NeedleProblem:
     def pose(self, query: Query, *, goal_tolerance_mm: float = 0.0) -> None:
         """Put a query to `setup`, whose planner, start and goal then wait for `setup.solve`.
 
-        `plan` asks its own query; pose again before `setup` is used after it.
-
-        Args:
-            goal_tolerance_mm: How far from the target a path may end, where the environment's own tolerance
-                is smaller.  OMPL's planners steer by chance and need about 1 mm; ours aim at what the
-                environment allows.
+        `plan` asks its own query; pose again before `setup` is used after it.  A larger `goal_tolerance_mm`
+        than the environment's own helps OMPL's planners, which steer by chance and need about 1 mm; ours aim
+        at what the environment allows.
         """
         self.setup.clear()
         self.setup.setGoal(self._ask(query, goal_tolerance_mm))

@@ -65,10 +65,8 @@ def tilt(angle: float, towards: float) -> Float:
 class Belief:
     """What is believed of a needle that is inserted: dead reckoning, corrected by each measurement.
 
-    Attributes:
-        frame ((4, 4) float64): Most likely pose of the tip, +x towards the bend.
-        target: (3,) float64, LPS mm.
-        lag_rad: By how much the bevel is most likely turned farther than commanded.
+    `frame` `(4, 4)` is the most likely pose of the tip, +x towards the bend, `target` `(3,)` that of the
+    target, LPS mm; by `lag_rad` the bevel is most likely turned farther than commanded.
 
     Args:
         query: Pose and target as they are taken to be at the start.
@@ -163,7 +161,6 @@ class Belief:
         return np.concatenate([aside * side + short * ahead, turn * up])
 
     def _move(self, transform: Float) -> None:
-        """Go on as commanded."""
         self.frame = self.frame @ transform
         self._reckoned.append(self._reckoned[-1] @ transform)
         self._at_mm.append(self._at_mm[-1])
@@ -302,15 +299,10 @@ def steer(
 ) -> tuple[tuple[Replan, ...], Failure | None]:
     """Insert a needle by a plan until it is done or stops; return the replans, and why it stopped.
 
-    A measurement is followed by a replan, if the last one is far enough back, with the curvature that the
-    needle is believed to reach.  If that finds no path, the needle goes on by the old one as long as this,
-    moved to where the tip is taken to be, is proved clear; otherwise it stops.
-
-    Args:
-        branch: Pierced branch, see `Query`.
-        step_mm: Piece of needle within which the errors are constant.
-        measure_every_mm: Insertion between two measurements; infinite for open loop.
-        replan_every_mm: Least insertion between two replans.
+    A measurement, `measure_every_mm` apart (infinite for open loop), is followed by a replan, if the last one
+    is at least `replan_every_mm` back, with the curvature that the needle is believed to reach.  If that
+    finds no path, the needle goes on by the old one as long as this, moved to where the tip is taken to be,
+    is proved clear; otherwise it stops.  Errors are constant within `step_mm` of needle.
     """
     most_per_mm = environment.limits.kappa
     commands = Commands(plan, most_per_mm)

@@ -116,7 +116,6 @@ class Decision:
         return True
 
     def _prove(self) -> None:
-        """Go on with the proof."""
         if self._proof is None:
             environment, query, _objective = self._asked
             self._proof = NoPathProof(environment, query)

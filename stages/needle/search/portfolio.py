@@ -119,7 +119,6 @@ class PortfolioSearch:
             size = min(2 * size, LARGEST_SIZE)
 
     def _guided_turns(self, finder: GuidePathFinder) -> "Iterator[Turn]":
-        """Yield turns of guided searches."""
         best, size = self._new(GUIDED), FIRST_SIZE
         while True:
             if self.path is not None and self.cost < best.cost:

@@ -318,7 +318,6 @@ def _row(length_mm: float, bend: ArrayLike) -> Float:
 
 
 def _doubled(array: NDArray[T]) -> NDArray[T]:
-    """Return a copy with twice as many rows, the new ones 0."""
     larger = np.zeros((2 * len(array), *array.shape[1:]), dtype=array.dtype)
     larger[: len(array)] = array
     return larger

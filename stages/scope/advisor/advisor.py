@@ -170,13 +170,9 @@ THINNEST_MM = 0.5
 class Advice:
     """What the user is advised to do.
 
-    Args:
-        action: "advance"; "pull back" where no motion leads on; "arrived" in the goal voxel.
-        motion: The best motion; None if the tip has arrived.
-        cost: Eq. 9 of the best motion; 0 if there is none.
-        candidates: All that were evaluated.
-        own: The evaluation of the user's own motion.
-        distance_mm: From the tip to the centre of the goal voxel, straight.
+    The action is "advance", "pull back" where no motion leads on, or "arrived" in the goal voxel, with no
+    `motion` and a `cost` (eq. 9) of 0.  `own` is the evaluation of the user's own motion; `distance_mm` leads
+    straight from the tip to the centre of the goal voxel.
     """
 
     action: Action
@@ -227,12 +223,9 @@ class Advisor:
         """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
 
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
-        reproduction); where none is valid even then, the advice is to pull back as the scope came.  Raises
-        AnatomyError if the tip is not in the lumen.
-
-        Args:
-            own: A motion that the user is about to make, evaluated at its own advance, at most the
-                look-ahead.
+        reproduction); where none is valid even then, the advice is to pull back as the scope came.  The
+        user's `own` motion is evaluated at its own advance, at most the look-ahead.  Raises AnatomyError if
+        the tip is not in the lumen.
         """
         tip = tip_frames(self.environment.model, state.array)[0][:3, 3]
         voxel = self.environment.lumen.voxel_at(tip)

@@ -92,12 +92,10 @@ class Candidates:
 
 @frozen_value
 class MotionEvaluation:
-    """The evaluation of the user's own motion beside the candidates.
+    """The evaluation of the user's own motion beside the candidates: one of `VERDICTS`, and eq. 9.
 
-    Args:
-        verdict: One of `VERDICTS`.
-        cost: Eq. 9 with the extremes of the candidates, terms held to [0, 1]; infinity if the motion is not
-            valid.
+    The cost has the extremes of the candidates, its terms held to [0, 1]; it is infinite if the motion is not
+    valid.
     """
 
     verdict: str
@@ -122,12 +120,8 @@ def evaluate_motions(
 ) -> tuple[Candidates, MotionEvaluation | None]:
     """Evaluate all candidates from a state (eqs. 3 to 9), and the user's own motion if there is one.
 
-    Args:
-        state: Its tip lies in the lumen.
-        advance_mm: Look-ahead of the candidates.
-        rng (numpy Generator): Moves all candidates but the middle one at random within their spacing (fig.
-            5b); they stay on the grid of eq. 3 if None.
-        own: A motion of the user, evaluated with the candidates' look-ahead.
+    The tip of the state lies in the lumen; all look ahead by `advance_mm`.  A generator moves all candidates
+    but the middle one at random within their spacing (fig. 5b); else they stay on the grid of eq. 3.
     """
     table = np.zeros((CANDIDATES + (own is not None), kernel.COLUMNS))
     if own is not None:

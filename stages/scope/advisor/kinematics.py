@@ -75,13 +75,10 @@ def model_of(scope: Bronchoscope, *, links: int = 10) -> ScopeModel:
 
 @frozen_record
 class ScopeState:
-    """Where the scope is: the base of its bending tip, and how the tip is turned.
+    """Where the scope is: the base `(4, 4)` of its bending tip, and how the tip is turned, alpha and beta.
 
-    Args:
-        lps_from_base ((4, 4) float64): The scope points along -z; a positive bend at twist 0 turns it towards
-            +y.  The base never rolls about its axis.
-        twist_rad: Alpha.
-        bend_rad: Beta.
+    The scope points along -z; a positive bend at twist 0 turns it towards +y.  The base never rolls about its
+    axis.
     """
 
     lps_from_base: Float

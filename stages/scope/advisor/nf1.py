@@ -46,12 +46,10 @@ class Goal:
 def goal_at(
     lumen: Lumen, lesion_lps: ArrayLike, lesion_radius_mm: float = 0.0, *, preferred: Bool | None = None
 ) -> Goal:
-    """Return the goal for a lesion, a sphere: the interior voxel nearest to its centre [Rosell2012, IV-B].
+    """Return the goal for a lesion, a sphere about a point `(3,)` LPS mm: the nearest interior voxel.
 
-    Args:
-        lesion_lps: (3,) float64, LPS mm.
-        preferred ((N,) bool): Voxels of the lesion that come before all others, such as those where a scope
-            fits.
+    It is chosen as in [Rosell2012, IV-B], but voxels of the lesion that are `preferred` `(N,)`, such as those
+    where a scope fits, come before all others.
 
     Raises:
         TargetError: If centre or radius are not finite, or the radius is negative.

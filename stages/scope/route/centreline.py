@@ -123,15 +123,10 @@ def from_tree(tree: AirwayTree) -> Centreline:
 
 
 def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> Centreline:
-    """Return the centreline of lines that need not be an airway, as a file holds them.
+    """Return the centreline of lines that need not be an airway, as a file holds them; points in LPS mm.
 
     Points that coincide to 0.001 mm become one, with the larger radius: files often begin each branch with a
     copy of the point that it hangs on.
-
-    Args:
-        points_lps: (N, 3) float64, LPS mm.
-        radius_mm: (N,) float64.
-        edges: (E, 2) int64.
     """
     points, radius = np.asarray(points_lps, dtype=np.float64), np.asarray(radius_mm, dtype=np.float64)
     # Points of a file that are nearer are one point, written twice with rounding.
@@ -154,11 +149,8 @@ def from_lung(lung: Lung) -> Centreline:
 def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
     """Return the centreline of any branching tube: vein, artery or airway, without a root.
 
-    The skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels as
-    solid boxes).  Raises AnatomyError if the mask is empty, or too small for a line.
-
-    Args:
-        mask: Non-zero inside the tube.
+    It is the skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels
+    as solid boxes).  Raises AnatomyError if the mask is empty, or too small for a line.
     """
     from anatomy.tree.lumen import prepare_lumen
     from anatomy.tree.skeleton import prune, spanning_tree, thin
@@ -183,11 +175,9 @@ def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
 
 
 def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
-    """Return the centreline of a drawing of vessels, in the plane z = 0.
+    """Return the centreline of a drawing of vessels, true inside one, in the plane z = 0.
 
-    Args:
-        drawing ((rows, columns) bool): True inside a vessel.
-        pixel_mm: Size of a pixel; the pixel in row i and column j is centred at x = j, y = i times that.
+    The pixel in row i and column j is centred at x = j, y = i times the size of a pixel.
 
     Raises:
         AnatomyError: If the drawing is empty or not two-dimensional.

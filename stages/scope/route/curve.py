@@ -89,11 +89,9 @@ class Curve:
 
 
 def interpolate(points_mm: ArrayLike) -> Curve:
-    """Return the cubic spline through points, with the length of the polyline as its parameter.
+    """Return the cubic spline through points `(n, 3)`, with the length of the polyline as its parameter.
 
-    Args:
-        points_mm ((n, 3) float64): At least two; points closer than 1e-6 mm to the one before are left out,
-            and midpoints are added to fewer than four.
+    Points closer than 1e-6 mm to the one before are left out, and midpoints are added to fewer than four.
 
     Raises:
         SettingsError: If fewer than two different points are given.

@@ -83,14 +83,9 @@ def repaired(
 ) -> tuple[Curve, float]:
     """Move the control points `free[0]` to `free[1] - 1` of a curve until it keeps to its limits.
 
-    Args:
-        free ((int, int)): The other control points stay, and with them the curve three spans away and its
-            smoothness.
-        start: What to solve before, as `SMOOTH`.
-
-    Returns:
-        (Curve, float): The new curve, and the largest violation of the stricter limits: a share of the limit
-            of curvature, or of the local radius.
+    The other control points stay, and with them the curve three spans away and its smoothness.  Returned are
+    the new curve and the largest violation of the stricter limits, a share of the limit of curvature or of
+    the local radius.  `start` says what to solve before, as `SMOOTH` does.
     """
     low, high = free
     guide, lumen, limits = problem.guide, problem.centreline, problem.limits
@@ -133,15 +128,10 @@ def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> l
 
 
 def repair_exact(tentative: Curve, problem: Problem, executor: Executor | None = None) -> tuple[Curve, Proof]:
-    """Return a curve that is proved to keep its limits, if the program finds one.
+    """Return a curve that is proved to keep its limits, else the one found with the fewest spans that fail.
 
-    Args:
-        tentative: Spline through points of the guide path.
-        executor: Repairs the segments of a round side by side; threads are enough, the program runs without
-            the lock.
-
-    Returns:
-        (Curve, Proof): If nothing worked, the curve with the fewest spans that fail.
+    It begins with the spline through points of the guide path.  An executor repairs the segments of a round
+    side by side; threads are enough, the program runs without the lock.
     """
     # Share of all spans by which a segment is widened on both sides, as in [Li2021].
     curve, proof = _by_segments(tentative, problem, 0.05, SMOOTH, executor)

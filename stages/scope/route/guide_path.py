@@ -81,25 +81,17 @@ class NoRouteError(LungaccessError):
 
 @frozen_record
 class Links:
-    """Which nodes the search may go to from a node, as a compressed list.
-
-    Args:
-        start ((N + 1,) int64): The links of node n are `nodes[start[n]:start[n + 1]]`.
-        nodes ((L,) int64): Nearest first.
-    """
+    """The links of node n, nearest first: `nodes[start[n]:start[n + 1]]`, (L,); `start` is (N + 1,)."""
 
     start: Int
     nodes: Int
 
 
 def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) -> Links:
-    """Link each node with its nearest ones, and with those it shares an edge with.
+    """Link each node with its nearest ones, k in [Li2021], and with those it shares an edge with.
 
-    A nearest node counts only if the balls around both overlap: otherwise it may lie behind a wall, in a
-    tube that runs past.  Raises SettingsError if `neighbours` is less than 1.
-
-    Args:
-        neighbours: Number of nearest nodes, k of [Li2021].
+    A nearest node counts only if the balls around both overlap: otherwise it may lie behind a wall, in a tube
+    that runs past.  Raises SettingsError if `neighbours` is less than 1.
     """
     from scipy.spatial import KDTree
 

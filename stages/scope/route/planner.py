@@ -78,13 +78,12 @@ def plan_route(
     executor: Executor | None = None,
     require_proof: bool = True,
 ) -> Route:
-    """Plan a route that is proved to keep its limits on the whole curve.
+    """Plan a route that is proved to keep its limits on the whole curve; all points are LPS mm.
 
     Breadth-first search over centreline nodes, a cubic B-spline through points of the guide path, and a
     repair of the segments that bend too much or come too near to the wall [Li2021].
 
     Args:
-        start_mm, goal_mm ((3,) float64): In the frame of the centreline (LPS mm), inside the lumen.
         repair: "exact": a nonlinear program; "ga": the genetic search of the paper, which has a seed; "none".
         links: Made with `nearest_links` beforehand, where many routes are planned on one centreline.
         executor: Repairs segments side by side.
@@ -166,14 +165,7 @@ def _route(
 class Replanner:
     """Plans a route anew for each new state of the anatomy, at the rate of a tracker.
 
-    What does not change while tubes move is kept: which nodes the route passes, and which tubes are near.
-
-    Args:
-        route: The route for the centreline as it was.
-
-    Examples:
-        >>> replanner = Replanner(centreline, route)            # doctest: +SKIP
-        >>> moved = replanner.replan(breathing(centreline.nodes_mm))   # doctest: +SKIP
+    What does not change while tubes move is kept: which nodes the old route passes, and which tubes are near.
     """
 
     def __init__(self, centreline: Centreline, route: Route) -> None:

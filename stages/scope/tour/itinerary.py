@@ -53,15 +53,11 @@ class Itinerary:
 
 
 def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = False) -> Itinerary:
-    """Return the shortest tour over chosen exits.
+    """Return the shortest tour over chosen exits, one index for each lesion; a closed one comes back.
 
-    It passes each stretch twice, an open one only once where it leads to the last exit, which is the
-    deepest.  Of the branches at a fork, the one with the last exit comes last, the others in the order of
-    their lesions.  Raises SettingsError if an exit belongs to another lesion.
-
-    Args:
-        chosen: For each lesion, the index of one of its exits.
-        closed: Whether to return to the root.
+    It passes each stretch twice, an open one only once where it leads to the last exit, which is the deepest.
+    Of the branches at a fork, the one with the last exit comes last, the others in the order of their
+    lesions.  Raises SettingsError if an exit belongs to another lesion.
     """
     if [subtree.exits[x].lesion for x in chosen] != list(range(subtree.n_lesions)):
         raise SettingsError("The chosen exits do not belong to the lesions", expected="one exit for each")

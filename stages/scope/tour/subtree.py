@@ -61,16 +61,12 @@ class Exit:
 def find_exits(
     tree: AirwayTree, lesions_lps: ArrayLike, *, rule: ExitRule | None = None, accepts: ExitTest | None = None
 ) -> tuple[tuple[Exit, ...], ...]:
-    """Return up to three exits for each lesion: the target positions P1, P2 and P3 of [Pan2025].
+    """Return up to three exits for each lesion `(M, 3)` LPS mm: P1, P2 and P3 of [Pan2025].
 
-    P1 has the smallest angle, P2 the smallest distance, P3 the smallest weighted sum of both; the paper
-    says largest, which would be the worst point.  Where two are the same point, it is listed once.  A lesion
-    whose centre lies in the lumen has one exit, the nearest point.  Raises TargetError if a lesion has no
-    candidate within reach.
-
-    Args:
-        lesions_lps: (M, 3) float64, LPS mm.
-        accepts: Tree points that it refuses are no candidates.
+    P1 has the smallest angle, P2 the smallest distance, P3 the smallest weighted sum of both; the paper says
+    largest, which would be the worst point.  Where two are the same point, it is listed once.  A lesion whose
+    centre lies in the lumen has one exit, the nearest point.  Tree points that are not accepted are no
+    candidates.  Raises TargetError if a lesion has no candidate within reach.
     """
     chosen = rule or ExitRule()
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
@@ -204,11 +200,7 @@ def subtree_to(
     weights: "Resistances | None" = None,
     exit_cost_mm: Sequence[Sequence[float]] | None = None,
 ) -> Subtree:
-    """Return the part of a tree that leads from the root to all exits.
-
-    Args:
-        exits: For each lesion, as `find_exits` returns them.
-        exit_cost_mm: For each exit, not negative; 0 if None.
+    """Return the part of a tree that leads from the root to the exits of each lesion; costs are 0 if None.
 
     Raises:
         SettingsError: If there are no lesions, one without exits, or more than 62.

@@ -290,13 +290,13 @@ class ExplorerPage extends DevicePage {
 
   // Keep what is found of a plan with what is known of it, and return it: a final one stays, and a check holds for one digest.
   async keepPlan(found, key) {
-    const known = this.plans.get(key), { packed, ...rest } = found;
-    const plan = known?.final ? known : { ...known, ...rest, key };
-    if (packed && plan !== known) plan.motion = await Motion.of({ ...packed, scope_tip_lps: found.scope_tip_lps });
-    this.plans.delete(key);
-    this.plans.set(key, plan);
-    if (this.plans.size > KEPT_PLANS) this.plans.delete(this.plans.keys().next().value);
-    return plan;
+    const { plans } = this, { packed, ...rest } = found, plan = { ...plans.get(key), ...rest, key };
+    if (packed) plan.motion = await Motion.of({ ...packed, scope_tip_lps: found.scope_tip_lps });
+    const kept = plans.get(key)?.final ? plans.get(key) : plan;
+    plans.delete(key);
+    plans.set(key, kept);
+    if (plans.size > KEPT_PLANS) plans.delete(plans.keys().next().value);
+    return kept;
   }
 
   // Have a plan checked and appraised, if it was not yet.
@@ -306,7 +306,8 @@ class ExplorerPage extends DevicePage {
 
   async takePlan(found, key) {
     const plan = await this.keepPlan(found, key), isFirst = this.motion === null;
-    if (key !== planKey(this.state.asked)) return;
+    // Another plan is asked for by now, or the masks were corrected.
+    if (key !== planKey(this.state.asked) || this.plans.get(key) !== plan) return;
     this.takeTarget(plan.motion.plan.target_lps);
     Object.assign(this, { plan, motion: plan.motion });
     this.planPanel.show(plan);
@@ -407,7 +408,7 @@ class ExplorerPage extends DevicePage {
   // Take the patient again, of which the masks were corrected: what was known of it holds no longer.
   async renew() {
     await this.asker.ask("patient", {}, (facts) => this.takeFacts(facts));
-    this.plans.clear();
+    this.plans = new Map();
     this.plan = this.motion = this.search.systemKey = null;
     this.compared.rows = [];
     this.follow();

@@ -38,12 +38,11 @@ export class Solids {
   }
 
   ring(place, side, other, radius, colour) {
-    let first = -1;
+    const first = this.places.length / 3;
     for (let k = 0; k < this.sides; k++) {
       const angle = (2 * Math.PI * k) / this.sides;
       const normal = add(times(side, Math.cos(angle)), times(other, Math.sin(angle)));
-      const number = this.vertex(add(place, times(normal, radius)), normal, colour);
-      if (k === 0) first = number;
+      this.vertex(add(place, times(normal, radius)), normal, colour);
     }
     return first;
   }

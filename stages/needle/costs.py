@@ -45,10 +45,7 @@ def inverse_clearance(obstacles: Obstacles, path: ArcPath) -> float:
 
 
 def map_integral(cost_map: Volume | None, path: ArcPath) -> float:
-    """Return the line integral of the cost map along a path, in mm: exact, voxel by voxel.
-
-    It is 0 without a map, and infinite if the path meets a voxel of infinite cost or leaves the grid.
-    """
+    """Return the exact line integral of the cost map along a path, mm; 0 without one, inf off its grid."""
     if cost_map is None:
         return 0.0
     voxels, lengths = _crossings(cost_map.grid, path)

@@ -184,10 +184,7 @@ def pose_at(frame: Float) -> tuple[float, ...]:
 
 
 def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
-    """Return the single arc from a pose to a point [Kuntz2015, `steer`].
-
-    The caller checks curvature and length against the needle's limits.
-    """
+    """Return the single arc from a pose to a point [Kuntz2015, `steer`]; no limit is checked here."""
     length, (curvature, *normal), _turn = arc_kernels.arc_to_point(pose_at(lps_from_start), as_point(target))
     return ArcPath(
         lps_from_start=lps_from_start,

@@ -136,10 +136,7 @@ def _cubes(points: Float) -> tuple[Int, Int]:
 
 
 class StartIndex:
-    """Start poses, points `(E, 3)` LPS mm and unit tangents, in bundles alike in place and direction.
-
-    It does not depend on the needle, so one index serves all of them.
-    """
+    """Start poses, points `(E, 3)` LPS mm and unit tangents, in bundles of like ones, for all needles."""
 
     def __init__(self, positions: ArrayLike, tangents: ArrayLike) -> None:
         places = np.asarray(positions, dtype=np.float64).reshape(-1, 3)

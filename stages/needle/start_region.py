@@ -120,10 +120,7 @@ class TriedStarts:
         return {words: int(np.count_nonzero(self.kinds == kind)) for kind, words in KINDS.items()}
 
     def table(self, rings: int = 5) -> Float:
-        """Return shares `(rings, rings)`: rows by offset, columns by tilt, each in equal steps.
-
-        NaN where no pose lies.
-        """
+        """Return shares `(rings, rings)`: rows by offset, columns by tilt, in even steps; NaN for no pose."""
         far = np.minimum((self.offsets_mm / self.offset_mm * rings).astype(int), rings - 1)
         wide = np.minimum((self.tilts_rad / self.tilt_rad * rings).astype(int), rings - 1)
         ring = (far[:, None] * rings + wide).ravel()

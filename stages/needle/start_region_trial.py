@@ -76,13 +76,9 @@ def try_around(
 ) -> TriedStarts:
     """Try poses around a pose: places on a lattice in a ball, each with directions spread evenly in a cone.
 
-    Args:
-        frame ((4, 4) float64): +z is the axis of the cone.
-        tried: Takes positions and tangents `(N, 3)` and returns `KINDS` `(N,)`.
-        directions: At each place.
-
-    Raises:
-        SettingsError: If a number is out of its range.
+    The cone's axis is +z of `frame` `(4, 4)`, `directions` are those at each place, and `tried` takes
+    positions and tangents `(N, 3)` and returns `KINDS` `(N,)`.  Raises SettingsError if a number is out of
+    its range.
     """
     _require_ranges(offset_mm, tilt_rad, poses, directions)
     places = max(poses // directions, 1)
@@ -126,10 +122,8 @@ def try_poses(
 ) -> UInt8:
     """Tell for each of N start poses how a clear path was found, or why none was: `KINDS`, `(N,)`.
 
-    Args:
-        query: Of the planned start: its target, and the branch that it has pierced.
-        path, iterations, seed: See `try_starts`.
-        positions, tangents ((N, 3) float64): Points, LPS mm, and unit vectors.
+    The target and the branch are those of `query`, from the planned start; `path`, `iterations` and `seed` as
+    in `try_starts`; `positions` `(N, 3)` are LPS mm, `tangents` `(N, 3)` unit vectors.
     """
     places = np.array(positions, dtype=np.float64, order="C")
     kinds = np.zeros(len(places), dtype=np.uint8)

@@ -303,10 +303,8 @@ class NoPathProof:
         return Plane(np.full(tuple(shape), bitmaps.ALL, dtype=np.uint64), low)
 
     def _reached(self, low: Int, high: Int, direction: int, number: int) -> tuple[Int, Int]:
-        """Return the first and last cell numbers on a plane that states between others may reach.
-
-        `direction` is 1 from the plane before and -1 from the one after.
-        """
+        """Return the first and last cells on a plane that states of that before (direction 1) or after (-1)
+        reach."""
         scale = self._scale
         reach = bounds.largest_reach(scale, self._depth, 2.0, low, *(high - low + 1)[:2])
         top = scale[bounds.TOP_SINE]

@@ -43,10 +43,7 @@ class Plane:
         return last
 
     def refined(self, *, directions: bool, require: Callable[[int], None]) -> "Plane":
-        """Return the same states in cells of half the side, those of directions too if asked.
-
-        `require` is called with the number of bytes that this takes, before it does.
-        """
+        """Return the states in cells half as wide, directions too if asked; `require` gets the bytes."""
         halved = np.array([directions, directions, True, True])
         shape = np.where(halved, 2 * np.array(self.bits.shape) + 1, self.bits.shape)
         require(8 * math.prod(int(n) for n in shape))

@@ -32,10 +32,7 @@ def seen_from(pose, q):
 
 @kernel()
 def arc_and_straight(rho, h, kappa):
-    """Return turn (rad, below 2 pi) and straight length of the path CS to a point, (inf, inf) if none.
-
-    None leads to points inside the circle of radius 1 / kappa on the point's side.
-    """
+    """Return turn (rad, below 2 pi) and straight length of the path CS to a point; (inf, inf) if none."""
     radius = 1.0 / kappa
     if rho < TINY and h >= 0.0:
         return 0.0, h

@@ -138,12 +138,9 @@ def voxels_on_arc(shape, geometry, pose, bend, length):
     """Return the voxels that an arc crosses, in its order.
 
     They are those that hold one of its ends or more than 1e-9 mm of it.  An end on a face lies in the voxel
-    of the higher index.
-
-    Returns:
-        - voxels ((N,) int64) - Their numbers, the first index running fastest; OFF_GRID beyond the grid.
-        - lengths ((N,) float64) - Length of arc in each, mm.
-        - pieces (int) - If 1, no voxel is met twice.
+    of the higher index.  Returned are their numbers (N,) int64, the first index running fastest and OFF_GRID
+    beyond the grid; the length of arc in each (N,), mm; and the number of pieces: if 1, no voxel is met
+    twice.
     """
     kappa = bend[0]
     most = _most_voxels(geometry, bend, length)

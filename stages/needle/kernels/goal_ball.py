@@ -15,10 +15,7 @@ from stages.needle.kernels.proof import MIN_ARC_MM, TINY
 
 @inner_kernel
 def turn_into_ball(rho, h, kappa, tolerance):
-    """Return the turn (rad) at which the arc C enters the ball about a point, inf if it never does.
-
-    The pose lies outside the ball.
-    """
+    """Return the turn (rad) at which the arc C from outside enters the ball about a point, inf if never."""
     radius = 1.0 / kappa
     aside = radius - rho
     centre2 = aside * aside + h * h
@@ -94,10 +91,7 @@ def least_length(rho, h, limits, cosine, turn_left):
 
 @kernel()
 def workspace_length(rho, h, limits):
-    """Return a length below which no path within all limits leads into the ball, inf outside the workspace.
-
-    The pose looks along its own reference, and nothing lies behind it; see `least_length`.
-    """
+    """Return `least_length` for a pose that is its own reference, nothing behind it; inf if out of reach."""
     length = least_length(rho, h, limits, 1.0, limits.max_turn_rad)
     return length if length <= limits.max_length_mm else math.inf
 
@@ -155,10 +149,7 @@ def shortest_into_ball(pose, goal, limits):
 
 @kernel()
 def single_into_ball(pose, goal, limits):
-    """Return the single arc towards the goal as far as the ball, bend and length.
-
-    The length is 0 where there is none, or it would be too tight, turn by more than 180 degrees, or be empty.
-    """
+    """Return bend and length of the single arc towards the goal up to the ball; a length of 0 for none."""
     length, bend, turn = arc_to_point(pose, goal)
     if bend[0] > limits.kappa * (1.0 + TINY) or turn > math.pi or length == math.inf:
         return bend, 0.0

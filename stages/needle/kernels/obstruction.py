@@ -72,15 +72,9 @@ def _walk(obstacles, limits, pose, bend, length, inserted, branch, least, least_
 def easiest_trial(obstacles, limits, pose, inserted, branch, goal, trials, state, trial, found):
     """Try the shortest path to a point and others by way of random points, without asking for clearance.
 
-    Args:
-        trials (int): How many random points are drawn.
-        state ((1,) uint64): Random state.
-        trial, found ((FOUND_SIZE,) float64): Scratch, and the tightest place of the path whose tightest place
-            has the most to spare.
-
-    Returns:
-        - label (int) - Of the voxel that is nearest there; 0 if no path could be laid.
-        - tried (int) - Paths laid.
+    `trials` random points are drawn with the random state `state` (1,) uint64; `trial` is scratch, and
+    `found` gets the tightest place of the path whose tightest place has the most to spare.  Returned are the
+    label of the voxel that is nearest there, 0 if no path could be laid, and the number of paths laid.
     """
     best, best_label, tried = -math.inf, 0, 0
     for number in range(trials + 1):

@@ -75,10 +75,7 @@ def _blocker_by_lookup(obstacles, step, pose, bend, length):
 
 @inner_kernel
 def kept_from_lumen(limits, inserted):
-    """Return the distance in mm that the axis keeps from every lumen in the exit, and its growth a mm.
-
-    The distance is negative where the lumen of the pierced branch does not count.
-    """
+    """Return how far (mm) the axis keeps from lumens in the exit, below 0 where none counts; growth a mm."""
     if limits.leaving_sine > 0.0:
         if inserted < WALL_ZONE_MM - TINY:
             return -1.0, 0.0

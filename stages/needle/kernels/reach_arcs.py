@@ -50,10 +50,8 @@ def least_clearance(obstacles, limits, pose, bend, length, s0, least):
 
 @inner_kernel
 def _arc_cost(obstacles, limits, start, branch, q, below, hints, entry):
-    """Return the estimated cost of the direct arc.
-
-    It is inf if the arc breaks a limit, is not proved clear, or costs no less than `below`.
-    """
+    """Return the estimated cost of the direct arc, inf if it breaks a limit, is not proved clear or costs
+    `below`."""
     chord2, aside = inverted_aside(start, q)
     chord = math.sqrt(chord2)
     c = blocked_at(obstacles, limits, start, aside, 0.0, limits.exempt_mm, chord, hints[entry])
@@ -109,10 +107,7 @@ def _extend(obstacles, limits, starts, order, mixed, q, radius, marks, hints, ch
     """Add start poses whose arcs to the points within `radius` of `q` come into question, a block at a time.
 
     `chosen` receives their numbers and `near` the poses, in the mixed order; `count` are there already, from
-    the first `scanned` of all.
-
-    Returns:
-        count, scanned (int): Both grown; `count` is not if no more poses come into question.
+    the first `scanned` of all.  Both are returned, grown; `count` is not if no more poses come into question.
     """
     total, before = mixed.shape[1], count
     while scanned < total and count == before:
@@ -321,10 +316,8 @@ def inverted_aside(start, q):
 
 @merged_kernel
 def _greatest_spread(aside, spread, c):
-    """Return how far arcs from one start may be apart where they are `c` away from it; inf if not bounded.
-
-    `aside` is that of one of the arcs, and that of the others differs from it by at most `spread`.
-    """
+    """Return how far arcs whose `aside` differs by `spread` at most may be apart at `c` from the start; inf:
+    unbounded."""
     sine = c * (math.sqrt(aside[0] ** 2 + aside[1] ** 2 + aside[2] ** 2) + spread)
     # Lean of a chord beyond which arcs of a bundle are not looked at together.
     return c * c * spread / math.sqrt(1.0 - sine * sine) if sine < 0.9 else math.inf
@@ -344,22 +337,17 @@ def _is_blocked_at(obstacles, limits, start, aside, spread, c):
 
 @inner_kernel
 def _spread(chord, radius):
-    """Return how much `inverted_aside` may differ for points within `radius` of one that is `chord` away.
-
-    Inversion divides distances by the product of the distances from the start.
-    """
+    """Return how much `inverted_aside` may differ within `radius` of a point that is `chord` away from the
+    start."""
     return radius / (chord * (chord - radius)) if chord > radius else math.inf
 
 
 @inner_kernel
 def blocked_at(obstacles, limits, start, aside, spread, begin, end, hint):
-    """Look for an obstacle at a few places of a bundle of arcs, first where one was met the last time.
+    """Look for an obstacle at places of a bundle of arcs; return the place, -1 if none was met.
 
-    A place is its distance from the start, as is `hint`.  Looked at are places from `begin` to `end`; no arc
-    is exempt there, since none is shorter than its chord.
-
-    Returns:
-        float: The place, -1 if none was met.
+    A place is its distance from the start, as is `hint`, where one was met the last time and is looked first.
+    Looked at are places from `begin` to `end`; no arc is exempt there, since none is shorter than its chord.
     """
     if hint >= begin and hint < end and _is_blocked_at(obstacles, limits, start, aside, spread, hint):
         return hint

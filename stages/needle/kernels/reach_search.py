@@ -1,7 +1,4 @@
-"""Many points and many start poses: paths of several arcs to the points that no single arc reaches.
-
-For `starts`, `branches` and `order` see `stages.needle.kernels.reach_arcs`.
-"""
+"""Paths of several arcs, from many start poses, to the points that no single arc of `reach_arcs` reaches."""
 
 import math
 

@@ -35,16 +35,11 @@ _LUMEN = np.int64(LUMEN)
 
 @kernel()
 def lay_stations(obstacles, limits, branch, start, points, arcs, stations):
-    """Lay single arcs from a start through points and cut them into cells.
+    """Lay single arcs from a start `(6,)` through points `(K, 3)` and cut them into cells.
 
-    Args:
-        start: (6,) float64, points : (K, 3) float64.
-        arcs ((K, ARC_COLUMNS) float64, stations : (MOST_STATIONS, STATION_COLUMNS) float64): Receive the arcs
-            and the cells.
-
-    Returns:
-        - count (int) - Of cells, 0 if an arc is missing or there are too many.
-        - angle (float) - Largest angle to the direction at the start, rad.
+    `arcs` `(K, ARC_COLUMNS)` and `stations` `(MOST_STATIONS, STATION_COLUMNS)` receive them, all float64.
+    Returned are the number of cells, 0 if an arc is missing or there are too many, and the largest angle to
+    the direction at the start, rad.
     """
     count = 0
     least = 1.0

@@ -51,10 +51,9 @@ def try_starts(
     there an arc or the shortest path.
 
     Args:
-        positions, tangents: (N, 3) float64.
-        vias: (V, 3) float64, LPS mm.
-        iterations, share (int, float): Of the RRT, see `grow_rrt`; 0 iterations for none.
-        seed (int): Of the random numbers; each pose has its own.
+        positions, tangents, vias: (N, 3), (N, 3), (V, 3) float64, LPS mm.
+        iterations, share, seed: Of the RRT, see `grow_rrt`; 0 iterations for none.  Each pose has its own
+            random numbers.
         nodes, parents (arrays): Scratch: a tree.
         kinds ((N,) uint8): Receives NO_PATH, DIRECT, VIA, SEARCHED, START_BLOCKED or OUT_OF_REACH.
     """

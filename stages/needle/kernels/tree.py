@@ -96,10 +96,7 @@ def add_arc(obstacles, limits, objective, branch, nodes, parents, count, near, b
 
 @kernel()
 def add_legs(obstacles, limits, objective, branch, nodes, parents, count, near, q, goal, best):
-    """Add the shortest path from node `near` to a point, as one or two rows; return the new `count`.
-
-    All or nothing: if the second leg is refused, the first is dropped.
-    """
+    """Add the shortest path from node `near` to a point, all of it or nothing; return the new `count`."""
     pose = pose_of(nodes[near])
     first, first_length, second, second_length = shortest_legs(pose, q, limits.kappa)
     if not first_length + second_length < math.inf:
@@ -156,10 +153,7 @@ def within(goal, tolerance, state):
 
 @kernel()
 def add_goal(obstacles, limits, objective, branch, nodes, parents, count, near, goal, best, state):
-    """Try to finish from node `near`: by the single arc, else by the shortest path; return the new `count`.
-
-    If rows were added, the last of them is at the goal.
-    """
+    """Finish at the goal from node `near`, by one arc or the shortest path; return the new `count`."""
     pose = pose_of(nodes[near])
     q = aim(pose, goal, limits, state)
     length, bend, _turn = arc_to_point(pose, q)

@@ -173,10 +173,7 @@ def put_numbers(state: Any, numbers: Sequence[float]) -> None:
 
 
 def path_of(solution: Any) -> ArcPath:
-    """Return a `control.PathControl` as arcs, one for each run of controls that bend alike.
-
-    Nothing is proved here: see `NeedleProblem.violation`.
-    """
+    """Return a `control.PathControl` as unproved arcs, one for each run of controls that bend alike."""
     arcs: list[list[float]] = []
     before: tuple[float, float] | None = None
     for n in range(solution.getControlCount()):

@@ -93,10 +93,7 @@ class NeedleProblem:
         return next(iter(self._searches))
 
     def planners(self) -> dict[str, Allocator]:
-        """Return what makes each planner: our searches by their names, and OMPL's own.
-
-        For `setup.setPlanner(allocator(problem.si))` or `setup.setPlannerAllocator(allocator)`.
-        """
+        """Return allocators for `setup.setPlannerAllocator` by name: our searches and OMPL's planners."""
         # The allocators may be kept by `setup`, so they must not refer to it: it would never be freed.
         environment, question = self.environment, self._question
 

@@ -70,15 +70,10 @@ def root_after(query: Query, path: ArcPath, cost: float) -> Root:
 
 
 def plan_ahead(plan: ArcPath, begin_mm: float) -> tuple[float, list[Ahead], list[Ahead]]:
-    """Return what a plan says from a length on.
+    """Return what a plan says from the length `begin_mm` on.
 
-    Args:
-        begin_mm: How much of the plan lies behind.
-
-    Returns:
-        - turned_rad - Turn of that part.
-        - corners, meetings (list of (float, (3,) float64)) - Ends of arcs beyond it but for the last, where
-          the target was, and points at the look-aheads.
+    Returned are the turn of the part behind, rad; and, as pairs of length and point `(3,)`, the ends of arcs
+    beyond it but for the last, where the target was, and the points at the look-aheads.
     """
     turned, at = 0.0, 0.0
     corners, meetings = [], []
@@ -106,14 +101,10 @@ def waypoints_ahead(corners: list[Ahead], meetings: list[Ahead]) -> Iterator[Way
 
 
 class Attempts:
-    """Paths that were tried from one root; the cheapest is kept.
+    """Paths that were tried from one root, of at most `most_points` points to pass; the cheapest is kept.
 
-    Args:
-        most_points: Most points to pass on a path.
-
-    Attributes:
-        path: From the root, proved clear and within all limits.
-        cost: Of the path, as estimated within the searches; infinite without one.
+    `path` is proved clear and within all limits; `cost` is its cost, as estimated within the searches,
+    infinite without one.
     """
 
     def __init__(

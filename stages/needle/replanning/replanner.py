@@ -54,10 +54,7 @@ def with_limits(environment: NeedleEnvironment, **limits: float) -> NeedleEnviro
 def blocker_at(
     environment: NeedleEnvironment, pose: tuple[float, ...], inserted_mm: float, branch: int
 ) -> int:
-    """Return the label of what a point of the needle is too near to, 0 if it is clear.
-
-    `inserted_mm` is the length of needle up to the point, `branch` the pierced one, -1 for none.
-    """
+    """Return the label that the needle's point at the length `inserted_mm` is too near to, 0 if clear."""
     straight = (0.0, 1.0, 0.0, 0.0)
     return int(
         blocker_on_arc(environment.obstacles, environment.limits, pose, straight, 0.0, inserted_mm, branch)
@@ -65,10 +62,7 @@ def blocker_at(
 
 
 def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, int]:
-    """Return the exact distance in mm from a query's start to what it has to keep clear of, and its label.
-
-    Beyond the required clearance and a little more it is not measured.
-    """
+    """Return the distance (mm) of a query's start from what it keeps clear of, if near, and its label."""
     _clearance, labels, geometry, bits = environment.obstacles
     reach = environment.required_clearance_mm + EXACT_REACH_MM
     point = as_point(query.lps_from_start[:3, 3])
@@ -87,13 +81,9 @@ def roots_of_tip(
 ) -> tuple[list[Root], float]:
     """Return where to plan from, the nearest first, and the clearance proved on the way there.
 
-    That is the tip itself.  Where the tip has lost the required clearance, it is the ends of short arcs that
-    lead back to it; on them the axis comes no nearer to an obstacle than the tip is, but for a little
-    slack, and never nearer than the needle's radius.
-
-    Args:
-        query: From the tip.
-        longest_mm: Longest arc.
+    That is the tip itself, where `query` starts.  Where the tip has lost the required clearance, it is the
+    ends of arcs of at most `longest_mm` that lead back to it; on them the axis comes no nearer to an obstacle
+    than the tip is, but for a little slack, and never nearer than the needle's radius.
     """
     required = environment.required_clearance_mm
     pose = pose_at(query.lps_from_start)
@@ -199,13 +189,9 @@ class Replan:
 
 
 def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnvironment:
-    """Return an environment whose needle bends less by a share of its largest curvature.
+    """Return an environment whose needle bends less by a share, 0 to below 1, of its largest curvature.
 
-    Args:
-        reserve: At least 0, less than 1.
-
-    Raises:
-        SettingsError: If the share is outside its range.
+    Raises SettingsError if the share is outside its range.
     """
     if not 0.0 <= reserve < 1.0:
         raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")

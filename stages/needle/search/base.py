@@ -56,9 +56,8 @@ def in_slices(
 ) -> Iterator[tuple[int, ArcPath | None]]:
     """Advance a search; yield after each slice the iterations spent, and the path if it is a better one.
 
-    Args:
-        iterations: Most to be spent.  One slice is begun in any case.
-        ended: Asked before each slice whether that is enough.
+    At most `iterations` are spent, but one slice is begun in any case; before each, `ended` is asked whether
+    that is enough.
     """
     used = 0
     while not (ended() or search.finished):
@@ -102,10 +101,7 @@ class TreeSearch:
 
 
 class RestartingRRT(TreeSearch):
-    """The RRT of [Kuntz2015], started anew by the schedule of [Luby1993] and whenever it succeeds.
-
-    Each tree grows only what can be cheaper than the best path so far.
-    """
+    """The RRT of [Kuntz2015], begun anew as [Luby1993] and at each path, then for cheaper ones only."""
 
     def __init__(
         self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST

@@ -173,9 +173,8 @@ class StateLatticeSearch:
     def everywhere(self, layers: int, *, skew: int = 0) -> GuidePath:
         """Return the cheapest guide path anywhere.
 
-        Args:
-            layers: More are finer, and take time by about the 7th power.
-            skew: Turns the lattice, less than SKEWS.
+        More `layers` are finer, and take time by about the 7th power; `skew`, less than SKEWS, turns the
+        lattice.
         """
         base, axes, goal_cells = self._straight(layers, skew)
         # No lattice over all of the space has as many cells.
@@ -184,20 +183,15 @@ class StateLatticeSearch:
     def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> GuidePath:
         """Return the cheapest guide path near another one, if it costs less than `bound`.
 
-        Args:
-            controls ((L + 2, 3) float64, LPS mm): As those of `GuidePath`.
-            cells: Size of a cell, as a share of what the greatest curvature allows.
-            turn_rad: Of the lattice about the line to the target.
+        `controls` `(L + 2, 3)` LPS mm are as those of `GuidePath`; `cells` is the size of a cell as a share
+        of what the greatest curvature allows, and `turn_rad` turns the lattice about the line to the target.
         """
         axes = self._axes(cells * self._largest_cell(len(controls) - 2), _beside(self._axis), turn_rad)
         # How many cells from a guide path the lattice around it goes.
         return self._explore(controls, axes, np.zeros(2, dtype=np.int64), 9, bound)
 
     def controls_of(self, path: ArcPath, layers: int) -> Float | None:
-        """Return controls `(L + 2, 3)` of a spline near a path; None if that does not always lead ahead.
-
-        A control point is where the tangents at the two planes beside it meet.
-        """
+        """Return a spline's controls `(L + 2, 3)` near a path; None if that does not always lead ahead."""
         # Distance of the points of a path between which its controls are interpolated.
         points, _ = path.sample(0.05)
         ahead = (points - self._start) @ self._axis

@@ -60,9 +60,8 @@ class OptimalSearch(RestartingRRT):
     def follow(self, points: Float) -> bool:
         """Go on from a path through via points if there is one that is cheaper; return whether there is.
 
-        Args:
-            points ((V, 3) float64, LPS mm): Ends of its arcs; nothing is followed whose last one lies beyond
-                the goal tolerance.
+        `points` `(V, 3)` LPS mm are the ends of its arcs; the last lies within the goal tolerance, or nothing
+        is followed.
         """
         missing = float(np.linalg.norm(points[-1] - self.query.target))
         if len(points) > MAX_VIAS or missing > self.environment.limits.goal_tolerance_mm + index.TINY:

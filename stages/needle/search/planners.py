@@ -43,8 +43,5 @@ _OWN: dict[str, MakeSearch] = {
 
 
 def searches() -> dict[str, MakeSearch]:
-    """Return what makes the searches by their names, those of other packages with them.
-
-    A package adds one by an entry point of the group `lungaccess.needle_planners`: a `MakeSearch`.
-    """
+    """Return searches by name; others add a `MakeSearch` by the entry point `lungaccess.needle_planners`."""
     return _OWN | registered(PLUGINS)

@@ -130,10 +130,8 @@ class PortfolioSearch:
     def _round(
         self, searches: list[OptimalSearch], patience: int, finder: GuidePathFinder | None = None
     ) -> "Generator[Turn, None, OptimalSearch]":
-        """Yield the turns of a round of halving; a finder, if given, guides the searches.  Return the best.
-
-        `patience` is how many iterations a search may take at least to find its first path.
-        """
+        """Yield the turns of a round of halving, guided if a finder is given; return the best.  A search
+        takes `patience` iterations at least to find its first path."""
         rung = searches
         halves = successive_halving(
             searches, attrgetter("cost"), work=FIRST_ITERATIONS, survivors=lambda size, _finite: size // 2

@@ -348,10 +348,8 @@ def _words(resolution: Resolution, kappa: float) -> Words:
 
 
 def _rates(objective: ObjectiveArrays, environment: NeedleEnvironment) -> tuple[float, float]:
-    """Return the least cost of a mm in this environment, and what a mm costs by which a path ends short.
-
-    The former counts the largest clearance that there is, where an objective knows none.
-    """
+    """Return the least cost of a mm, at the largest clearance there is, and what a mm costs that a path ends
+    short."""
     least = objective.least_rate
     if objective.inverse_clearance == 0.0:
         return least, least

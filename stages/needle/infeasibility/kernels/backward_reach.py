@@ -193,10 +193,8 @@ def never_from(reach, x, y, z, around, free):
 
 @merged_kernel
 def _in_both(h, one, other):
-    """Return a ball that holds where two balls, h apart, meet: its middle as a share of the way, its radius.
-
-    The radius is below 0 if they do not meet.
-    """
+    """Return the ball that holds where two balls, h apart, meet: middle as share of the way, radius; below 0:
+    none."""
     if h > one + other:
         return 0.0, -1.0
     if h < SPARE:

@@ -98,11 +98,10 @@ def dilate(target, source, box, square, disc, dy, dx, scratch, row):
     Both in cells, any fraction.  A cell is reached if its centre is: the caller adds what a cell is wide.
 
     Args:
-        target: (Y, W) uint64, source : (Y', W') uint64.
+        target, source: (Y, W), (Y', W') uint64.
         box ((4,) int64): First and last row, first and last word of the source that count.
-        square, disc: float.
-        dy, dx: int.
-        scratch ((S,) uint64, row : (W,) uint64): Workspace; see `spread`.
+        dy, dx (int): The move, in cells.
+        scratch, row ((S,), (W,) uint64): Workspace; see `spread`.
     """
     to_rows = target.shape[0]
     reach = int(math.floor(square + disc))

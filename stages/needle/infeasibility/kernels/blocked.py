@@ -40,10 +40,8 @@ def _probed_at(v, u, window, scale, depth):
 def mark_probed(states, window, scale, depths, probed, corners):
     """Set the bits of the cells that the tangents of a plane's states meet at some depths.
 
-    Args:
-        depths ((D,) float64): As seen from the plane, mm.
-        probed: (D, Y', W') uint64.
-        corners ((D, 2) int64): Cell numbers (y, x) of the first cell of each.
+    Seen from the plane these are `depths` (D,) mm; `probed` (D, Y', W') uint64 receives the bits, and
+    `corners` (D, 2) int64 are cell numbers (y, x) of the first cell of each.
     """
     nv, nu, _rows, _words = states.shape
     box = np.zeros(4, np.int64)
@@ -167,13 +165,10 @@ def flood(
     A path goes from one cube to another through a point of both, so to one of its 26 neighbours.
 
     Args:
-        obstacles: Obstacles.
-        limits: Limits.
         exempt_branch (int): Branch whose wall is exempt in the exit; -1 for none.
-        inserted (float): Length of the needle at the start, mm.
+        inserted, side (float): Length of the needle at the start, and side of the cubes, mm.
         scale, ends: (SCALE_SIZE,), (ENDS_SIZE,) float64.
         frame ((4, 3) float64): Position of the start; the planes' normal, row and column direction.
-        side (float): Of the cubes, mm.
         corner ((3,) int64): Cube numbers (depth, y, x) of the first cube; that of the start has numbers 0.
         seen ((H, Y, X) bool): All False at first; those looked at are set.
         queue ((Q,) int32): Cubes that may be passed, with room for the NEIGHBOURS of so many.

@@ -68,10 +68,7 @@ def largest_slope_change(sine, scale, depth):
 
 @kernel(nogil=True)
 def largest_aside(sine, scale, depth, low, high):
-    """Return how far a path may miss the place to which the mean of both slopes leads, in mm.
-
-    `sine` is the largest at one end; over the slab the slope changes by between `low` and `high`.
-    """
+    """Return how far (mm) paths may miss where both slopes' mean leads; slopes change by `low` to `high`."""
     kappa = scale[KAPPA]
     other = sine / math.sqrt(1.0 - sine * sine) + high
     # The sine changes by kappa a mm, so between the ends it is at most their mean and half of that.
@@ -153,11 +150,8 @@ def _state_margin(h, y, x, slope_v, slope_u, blur, scale, ends):
 def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
     """Remove the states of a plane from which the goal cannot be reached, or which the start cannot reach.
 
-    Args:
-        depth (float): Of the plane, mm.
-        reference ((3,) float64): Direction from which the limit of the angle counts: its component along the
-            planes' normal, and its row and column.
-        max_angle (float): That limit, rad.
+    The plane lies `depth` mm deep.  The limit of the angle, `max_angle` rad, counts from the direction
+    `reference` (3,): its component along the planes' normal, and its row and column.
     """
     nv, nu, rows, words = states.shape
     cell = scale[CELL]
@@ -211,10 +205,8 @@ def prune_unreachable(states, window, scale, ends, depth, reference, max_angle):
 
 @inner_kernel
 def _set_run(row, x, margin, step):
-    """Set the bits from `x` on if `margin` is not negative, as far as its sign is sure; return their end.
-
-    The margin changes by at most `step` from bit to bit.
-    """
+    """Set the bits from `x` on where `margin`, which changes by `step` a bit, is surely not negative; return
+    their end."""
     run = min(max(int(math.ceil(abs(margin) / step)), 1), 64 * row.shape[0] - x)
     end = x + run
     if margin < 0.0:

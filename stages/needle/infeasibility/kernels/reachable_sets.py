@@ -37,11 +37,10 @@ def step_sets(now, now_window, scale, depth, direction, blur, edges, out, out_wi
     inequality of Cauchy and Schwarz at most w d^2 sqrt((1 - r^2) / 12) where the slope changes by r w d.
 
     Args:
-        now, out ((V, U, Y, W) uint64): States of this plane, and of the other.
-        now_window, out_window: (4,) int64.
+        now, out ((V, U, Y, W) uint64): States of this plane, and of the other; their windows are (4,) int64.
         scale: (SCALE_SIZE,) float64.
-        depth (float): Distance of the planes in mm.
-        direction (int): 1 to the next plane, -1 to the one before.
+        depth, direction (float, int): Distance of the planes in mm; 1 to the next plane, -1 to the one
+            before.
         blur (float): 2, or 1 if the one state in `now` is known exactly.
         edges ((C,) float64): Upper edges of the classes of slope change, as shares of the largest, rising to
             1.

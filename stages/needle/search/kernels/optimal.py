@@ -160,11 +160,8 @@ def _is_promising(nodes, vias, count, limits, rate, best):
 
 @merged_kernel
 def _mutate(vias, trial, count, goal, limits, state):
-    """Write a variation of via points to `trial`; return how many it has.
-
-    A point is moved, dropped, added or reached by the other kind of leg; the last point stays within the goal
-    tolerance.
-    """
+    """Write a variation of via points to `trial`; return how many.  The last one stays within the goal
+    tolerance."""
     for m in range(count):
         for n in range(VIA_COLUMNS):
             trial[m, n] = vias[m, n]

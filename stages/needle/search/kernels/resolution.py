@@ -114,10 +114,8 @@ def _add(
     obstacles, limits, objective, rates, branch, goal, reference, words, merge, store, counts, at, primitive,
     rank, most,
 ):  # fmt: skip
-    """Make the node at the end of a primitive from node `at`; return its estimate, inf if there is none.
-
-    The primitive is proved clear as a whole, or is the first part of one that was.
-    """
+    """Make the node at the end of a proved primitive from node `at`; return its estimate, inf if there is
+    none."""
     nodes, links, proved, seen = store
     fine_mm, rolls, arcs = words[0], words[1], words[2]
     n_rolls, full, row = rolls.shape[0], arcs.shape[0] - 1, counts[NODES]

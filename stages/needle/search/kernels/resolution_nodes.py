@@ -111,10 +111,8 @@ def follow(nodes, words, bend, at, direction, steps, row):
 
 @inner_kernel
 def _hash(nodes, row, merge, across):
-    """Return a number, at least 0, of the cell that holds a node's pose.
-
-    Of the cell across the nearest face instead, along each axis whose bit is set in `across`.
-    """
+    """Return a number, at least 0, of the cell that holds a pose, or of the nearest cell along the axes in
+    `across`."""
     h = 0
     for m in range(6):
         size = merge[0] if m < 3 else merge[1]

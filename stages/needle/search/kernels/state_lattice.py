@@ -36,10 +36,8 @@ def _hexagonal_norm(a, b):
 
 @inner_kernel
 def _place(table, states, begin, a, b, at_a, at_b):
-    """Return the slot of a state in a hash table: its own, or the empty one where it belongs.
-
-    States before `begin` are those of layers behind and count as empty.
-    """
+    """Return the slot of a state in a hash table, its own or an empty one; states before `begin` count as
+    empty."""
     mask = len(table) - 1
     slot = (((a * 73 + b) * 1031 + at_a) * 4099 + at_b) * 0x9E3779B1 >> 12 & mask
     while table[slot] >= begin:
@@ -234,10 +232,7 @@ def _follow(
 
 @kernel(nogil=True)
 def cheapest_guide_path(base, axes, goal_cells, begins, states, before, costs, controls):
-    """Write the cheapest path to the goal; return its cost, infinite if there is none.
-
-    `controls` (L + 2, 3) gets start, vertices, and goal.
-    """
+    """Write the cheapest path, goal included, to `controls` (L + 2, 3); return its cost, inf if none."""
     layers = len(base) - 2
     best, least = NONE, math.inf
     for n in range(begins[layers], begins[layers + 1]):

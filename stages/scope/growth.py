@@ -58,9 +58,8 @@ class StateTree:
 class Growth:
     """Grows the states of a scope along the routes of an airway.
 
-    Args:
-        tried ((N,) bool): Tree points that the scope might get to; routes end at the last of them.
-        passable ((N,) bool): Tree points to which a ball as thick as the scope gets along the axis.
+    `tried` `(N,)` marks tree points that the scope might get to; routes end at the last of them.  `passable`
+    `(N,)` marks those to which a ball as thick as the scope gets along the axis.
     """
 
     def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:
@@ -109,10 +108,8 @@ class Growth:
         return self._layers[branch][-1][1] if self._layers.get(branch) else 0.0
 
     def _ends_before(self, branch: int) -> bool:
-        """Tell whether the parent's states end before its fork, as those along this branch would then.
-
-        The routes of both are the same until TANGENT_MM before the fork, and so are the searches.
-        """
+        """Tell whether the parent's states end before its fork, up to where both routes and searches are the
+        same."""
         if branch == 0:
             return False
         fork = int(self._tree.parent_point[self._tree.branch_start[branch]])

@@ -44,11 +44,7 @@ class ScopeMotion:
 
     @property
     def pieces(self) -> Float:
-        """The arcs of the body in the last state, from the entry to the tip, the section last, `(P, 3)`.
-
-        Each row holds length in mm, roll before it in rad and signed curvature in 1/mm, as
-        `anatomy.poses.poses_on_arc` takes them, with the roll kept for the next piece.
-        """
+        """The last state's arcs, entry to tip, `(P, 3)`, as `anatomy.poses.poses_on_arc` takes them."""
         return laid_pieces(self.states, self.bending_length_mm)
 
     @property
@@ -57,11 +53,7 @@ class ScopeMotion:
         return float(self.states[-1, ADVANCE] - self.states[0, ADVANCE]) + self.bending_length_mm
 
     def body(self, step_mm: float) -> Float:
-        """Return frames `(N, 4, 4)` along the body in the last state, at most `step_mm` apart, the tip last.
-
-        The +x of the last one is the way a positive bend turns the tip: it is the frame of the working
-        channel.
-        """
+        """Return frames `(N, 4, 4)` along the last state's body, `step_mm` apart; the channel's is last."""
         return poses_on_pieces(self.lps_from_entry, self.pieces, step_mm)[0]
 
     @property
@@ -95,10 +87,7 @@ class ScopeMotion:
         return replace(self, states=np.concatenate(states))
 
     def written(self, decimals: int) -> "ScopeMotion":
-        """Return the motion that is made by who reads its states in mm and degrees with so many decimals.
-
-        Bends are cut off rather than rounded, so that they stay within the limits of the device.
-        """
+        """Return the motion as read in mm and degrees of so many decimals; bends are cut off, not rounded."""
         scale = 10.0**decimals
         advance, (twist, bend) = self.states[:, ADVANCE], np.degrees(self.states[:, 1:]).T
         # A number that misses a whole one by less is whole: it went through radians.

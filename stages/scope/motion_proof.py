@@ -1,7 +1,4 @@
-"""The proof of one motion of a bronchoscope: limits, room in and between states; and tips before and after.
-
-These lie along its own motion, each with a proved motion of its own.
-"""
+"""The proof of one motion of a bronchoscope: limits, room in and between states; and proved tips along it."""
 
 import math
 from weakref import WeakKeyDictionary
@@ -82,7 +79,8 @@ class MotionProver:
         return float(room)
 
     def tolerances(self, motion: ScopeMotion) -> Float:
-        """Return by how much advance in mm, twist and bend in rad may err in each step `(M - 1, 3)`.
+        """Return by how much advance in mm, twist and bend in rad may err in each step `(M - 1, 3)` of a
+        proved motion.
 
         If one of the three errs by no more than this anywhere in a step of a proved motion, and all else is
         as stated, the scope with its gap stays in the lumen during it.  Larger values may be possible,
@@ -236,10 +234,7 @@ class TipRow:
 
 
 def shifted(motion: ScopeMotion, shift_mm: float) -> ScopeMotion:
-    """Return a motion whose base stops `shift_mm` farther, where the section takes the same twist and bend.
-
-    The base stops earlier on its way, or goes on along its last arc.  It says nothing about the lumen.
-    """
+    """Return a motion whose base stops `shift_mm` farther, its section turned alike; nothing is proved."""
     states = motion.states
     stop = float(states[-1, ADVANCE]) + shift_mm
     slides = np.flatnonzero(np.diff(states[:, ADVANCE]) > SHORTEST_MM)

@@ -76,10 +76,8 @@ def find_passages(lung: Lung, scope: Bronchoscope, *, reach_mm: float) -> Passag
 
 
 def _narrowest_on_the_route(lung: Lung) -> Float:
-    """Return the proved lumen radius of the narrowest place between the root and each point.
-
-    The depth in the lumen is 1-Lipschitz: between two samples it is at most half their distance less.
-    """
+    """Return the proved lumen radius of the narrowest place from the root to each point; depth is
+    1-Lipschitz."""
     tree = lung.tree
     parent = np.maximum(tree.parent_point, 0)
     step = tree.points_lps - tree.points_lps[parent]

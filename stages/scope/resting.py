@@ -191,11 +191,8 @@ class RestingShaft:
         pull: Float,
         laid: Float,
     ) -> float:
-        """Return how far the hand follows while the shaft settles, until nothing needs to hold the tip.
-
-        The laid shaft is longer than one at rest: it would push the tip out of its branch, or, drawn back too
-        far, pull it out.
-        """
+        """Return how far the hand follows while the shaft, too long as laid, settles until nothing needs to
+        hold the tip."""
         # How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its
         # branch.
         held = shaft._replace(hold=1.0)

@@ -85,11 +85,9 @@ def legs_of(motion: ScopeMotion) -> Legs:
 class Simplifier:
     """Looks for motions of fewer changes and twists to the end of a proved one.
 
-    Args:
-        device: The scope, and the largest curvature that what passes its channel can stand.
-        motion: A proved motion.
-        end_bends_rad ((float, float)): Bends farthest down and up of the section at the tip.
-        least_mm: The room that a simpler motion keeps.
+    The device is the scope, and the largest curvature that what passes its channel can stand.
+    `end_bends_rad` are the bends farthest down and up of the section at the tip, and `least_mm` is the room
+    that a simpler motion keeps.
     """
 
     def __init__(
@@ -236,10 +234,8 @@ class Simplifier:
         return float(change), Legs(group.astype(np.int64), legs.twists[used], bends, advances)
 
     def _fitted(self, legs: Legs, bounds: Float | None = None) -> Legs | None:
-        """Return legs near to some that end in the pose and are proved, None if none are found.
-
-        Bounds `(n, 2)` of the unknowns are given where they are narrower than those of the device.
-        """
+        """Return proved legs near to some that end in the pose, None if none are found; bounds `(n, 2)` may
+        be narrower."""
         x = legs.unknowns
         # Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide.
         counts = np.ceil((np.append(legs.advances, 0.0) + self._device.length) / 2.0).astype(np.int64)

@@ -57,10 +57,7 @@ LOOK_AHEADS = (0.5, 1.0, 1.5, 2.0)
 
 
 class PathSearch:
-    """Algorithm 2 from a state, repeated with retreats until the goal of the environment is reached.
-
-    In reproduction the look-ahead is never shortened and nothing is retried.
-    """
+    """Algorithm 2 from a state, with retreats until the goal is reached; reproduction retries nothing."""
 
     def __init__(self, environment: ScopeEnvironment, goal: Goal, options: PathSettings, seed: int) -> None:
         self._environment = environment
@@ -220,7 +217,7 @@ class Advisor:
         return self.environment.field
 
     def advise(self, state: ScopeState, *, own: Motion | None = None) -> Advice:
-        """Return the best motion from any state whose tip is in the lumen, and evaluate the user's own one.
+        """Return the best motion from any state whose tip is in the lumen, and evaluate the user's `own` one.
 
         Where no candidate is valid the look-ahead is halved, down to the smallest voxel side (not in
         reproduction); where none is valid even then, the advice is to pull back as the scope came.  The

@@ -24,10 +24,7 @@ CANDIDATES = kernel.CANDIDATES
 
 @settings
 class Weights:
-    """Weights of the terms of a motion's cost (eq. 9); they add up to 1.
-
-    The terms favour nearness to the goal, the middle of the lumen, and small and steady twists.
-    """
+    """Weights of a motion's cost (eq. 9), which add up to 1: for goal, middle, few and steady twists."""
 
     nf1: Annotated[float, quantity("weight of the potential", at_least=0.0, at_most=1.0)] = 0.4
     clearance: Annotated[float, quantity("weight of the clearance", at_least=0.0, at_most=1.0)] = 0.4

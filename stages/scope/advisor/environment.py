@@ -21,10 +21,9 @@ from stages.scope.advisor.nf1 import NavigationField
 class ScopeEnvironment:
     """A scope in a lumen with a goal: what the scope collides with, and where it is to go.
 
-    Args:
-        reproduction: Eq. 1 decides about collisions and eq. 3 about twists as printed: i times a tenth of the
-            range, held within the range.  Otherwise the scope's radius is kept along its whole body, and the
-            twists cover their whole range.  What eq. 1 allows must not feed a plan.
+    In reproduction eq. 1 decides about collisions and eq. 3 about twists as printed: i times a tenth of the
+    range, held within the range.  Otherwise the scope's radius is kept along its whole body, and the twists
+    cover their whole range.  What eq. 1 allows must not feed a plan.
     """
 
     model: ScopeModel
@@ -77,10 +76,7 @@ class ScopeEnvironment:
         return self._measure(states)[0]
 
     def distances(self, states: Float) -> Float:
-        """Return the distances of states (M, 14) [Rosell2012, sec. IV-D]: sums of L1 clearances, in voxels.
-
-        Counted are the base spheres of all links, link 0 among them, and the last end sphere.
-        """
+        """Return sums of L1 clearances (voxels) of states (M, 14) at links and tip [Rosell2012, IV-D]."""
         return self._measure(states)[1]
 
     def _measure(self, states: Float) -> tuple[Bool, Float]:

@@ -104,10 +104,7 @@ class ScopeState:
 
 
 def straight_state(base_lps: Float, forward: Float) -> ScopeState:
-    """Return the state of a straight scope whose bending tip begins at a point (3,) LPS mm.
-
-    Twist 0 and a positive bend turn the tip anteriorly, or superiorly where it looks along that axis.
-    """
+    """Return the state of a straight scope whose bending tip begins at a point, turned as `start_state`."""
     frame = pose(base_lps, forward)
     base = np.eye(4)
     base[:3, :3] = np.column_stack([frame[:3, 1], frame[:3, 0], -frame[:3, 2]])

@@ -92,11 +92,7 @@ class Lumen:
         return read_only(out)
 
     def width_from(self, start: int) -> Float:
-        """Return the radius (N,) mm of the largest ball that gets from voxel `start` to each voxel.
-
-        The ball goes from centre to centre of neighbouring voxels; between them it may touch by less
-        than half a voxel.
-        """
+        """Return the radius (N,) mm, to half a voxel, of the largest ball that gets from `start` to each."""
         if start not in self._widths:
             depth = (self.depth_mm * DEPTH_UNITS_PER_MM).astype(np.int64)
             out = np.zeros(self.count, dtype=np.int64)

@@ -25,14 +25,10 @@ THRESHOLD = 0.9
 
 @frozen_record
 class Goal:
-    """The voxel where the tip has to end.
+    """The voxel where the tip has to end, by its number, its centre and that of the lesion, `(3,)` LPS mm.
 
-    Args:
-        voxel: Number of the interior voxel.
-        centre_lps ((3,) float64, LPS mm): Its centre.
-        lesion_lps ((3,) float64, LPS mm): Centre of the lesion.
-        distance_mm: From the centre of the lesion to that of the voxel.
-        in_lesion: Whether the voxel lies in the lesion; if not, it is the lumen voxel nearest to it.
+    `distance_mm` is that between the two centres; if the voxel is not in the lesion, it is the lumen voxel
+    nearest to it.
     """
 
     voxel: int

@@ -85,10 +85,7 @@ class ScopePath:
         return kinematics.tip_frames(self.model, self.states)
 
     def between(self, number: int, fraction: float) -> Float:
-        """Return the state (14,) at a fraction of the motion from state `number - 1` to state `number`.
-
-        The base moves along its arc while twist and bend change evenly.
-        """
+        """Return the state (14,) at a share of the motion to state `number`: on an arc, at an even turn."""
         before, after = self.states[number - 1], self.states[number]
         advance_mm = fraction * float(self.steps_mm[number])
         moved = kinematics.advanced(
@@ -98,10 +95,7 @@ class ScopePath:
         return moved
 
     def body(self, number: int, spacing_mm: float = 0.25) -> Float:
-        """Return points `(B, 3)` LPS mm along the body in a state, from the first base to the tip.
-
-        Behind the base the body lies where the base has been.
-        """
+        """Return points `(B, 3)` LPS mm along the body in a state, where the base has been, to the tip."""
         shaft = [self.states[0, 9:12]]
         for k in range(1, number + 1):
             pieces = max(1, math.ceil(float(self.steps_mm[k]) / spacing_mm))
@@ -246,10 +240,8 @@ def _place(from_carina_mm: float) -> str:
 
 
 def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, ...]:
-    """Return what to do branch by branch, up to the state nearest to the goal.
-
-    The tip is taken to be in the branch of the tree point nearest to it on the route to where it ends.
-    """
+    """Return what to do branch by branch, by the tree point nearest to the tip, as far as nearest to the
+    goal."""
     tips = path.tips()[: path.nearest + 1, :3, 3]
     # For each tip the nearest tree point on the route to the last one, never going back.
     route = tree.route(tree.nearest_point(tips[-1]))

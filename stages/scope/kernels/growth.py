@@ -83,10 +83,7 @@ def pursuit(points, base, near, ahead_mm):
 
 @inner_kernel
 def settle(route, length, state, scratch):
-    """Fill in the tip of a state, its direction and the route point near it, and return the place's cost.
-
-    That is the section's distance from the axis as a share of the room, and the angle of tip and axis.
-    """
+    """Fill in tip, direction and route point of a state; return its cost: off-axis share and angle."""
     u, v = state[U], state[V]
     move_along(state, u, v, length, scratch)
     near, d2 = nearest_on_route(route.points, int(state[NEAR]), scratch[9], scratch[10], scratch[11])

@@ -78,10 +78,7 @@ def _weights(f, row):
 
 @inner_kernel
 def depth_at(lumen, x, y, z, work):
-    """Return the signed depth at a point, mm; `work` (28,) begins with its gradient.
-
-    Off the grid it is deep in the wall, without a gradient.
-    """
+    """Return the signed depth at a point, mm, least off the grid; `work` (28,) begins with its gradient."""
     g, field = lumen.geometry, lumen.depth
     u = g[0, 0] * x + g[0, 1] * y + g[0, 2] * z + g[0, 3]
     v = g[1, 0] * x + g[1, 1] * y + g[1, 2] * z + g[1, 3]
@@ -121,10 +118,7 @@ def depth_at(lumen, x, y, z, work):
 
 @inner_kernel
 def energy_of(lumen, shaft, frames, curvature, pull, slope):
-    """Lay the arcs one after the other from the first of `frames` (N + 1, 12), and return the energy in N mm.
-
-    pull : (N, 3) forces at the ends of the arcs in N.
-    """
+    """Lay arcs from the first of `frames` (N + 1, 12); return the energy, N mm; `pull` (N, 3) is in N."""
     total = 0.0
     for n in range(curvature.shape[0]):
         u, v = curvature[n, 0], curvature[n, 1]
@@ -190,10 +184,8 @@ def _arc_moves(frame, u, v, s, by):
 
 @inner_kernel
 def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step, gain):
-    """Carry gradient and second derivatives from the end of arc `n` to its begin; fill its step and gain.
-
-    Returns the fall of the energy that the arc's own step is worth, -1 where the energy is not convex.
-    """
+    """Carry the derivatives to the begin of arc `n`, fill step and gain; return the step's fall, -1: not
+    convex."""
     by, moved, cross = work[0:2], work[2:8], work[8:10]
     s, stiff = shaft.length[n], shaft.stiffness[n]
     u, v = curvature[n, 0], curvature[n, 1]
@@ -273,10 +265,8 @@ def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step,
 
 @inner_kernel
 def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hess, step, gain):
-    """Find the step of every arc, from the tip to the entry.
-
-    Returns the fall of the energy that is expected, -1 where the energy is not convex.
-    """
+    """Find the step of every arc, from tip to entry; return the energy's expected fall, -1 where it is not
+    convex."""
     last = curvature.shape[0]
     expected = short = 0.0
     for k in range(3):
@@ -299,10 +289,7 @@ def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hes
 
 @inner_kernel
 def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
-    """Lay the shaft anew with steps of a size, each arc answering to how its begin has moved.
-
-    Returns the longest way of the end of an arc, mm.
-    """
+    """Lay the shaft anew with steps of a size, each arc answering to its begin; return the longest way, mm."""
     to_frames[0] = frames[0]
     longest = 0.0
     for n in range(curvature.shape[0]):
@@ -339,12 +326,10 @@ def bring_to_rest(lumen, shaft, entry, curvature, pull, frames, enough, most_ste
     Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps.
 
     Args:
-        entry ((12,) float64): Frame in which the shaft begins.
+        entry, frames ((12,), (N + 1, 12) float64): Frame in which the shaft begins; becomes those of arcs'
+            ends.
         pull ((N, 3) float64): Forces on the ends of the arcs, N, which do not change with the shape.
-        frames ((N + 1, 12) float64): Becomes the frames of the entry and of the ends of all arcs.
-        enough (float): A step that is expected to lower the energy by less than this, N mm, is not taken any
-            more.
-        most_steps: int.
+        enough (float): No step is taken that is expected to lower the energy by less than this, N mm.
     """
     count = curvature.shape[0]
     work, slope = np.zeros((10, 6)), np.zeros(WORK)

@@ -124,10 +124,7 @@ def kind_of(places, near, tip):
 
 @inner_kernel
 def setting_beside(device, most_curvature, state, offset, own):
-    """Return curvature vector, twist, bend and by_straight of a section beside that of a state.
-
-    The bend is infinite if there is no such section; `own` takes the state's own twist and bend.
-    """
+    """Return a section's curvature vector, twist, bend (inf: none) and by_straight beside a state's."""
     u = state[U] + offset[0]
     v = state[V] + offset[1]
     twist, bend, straight = state[TWIST], state[BEND], False
@@ -177,10 +174,7 @@ def sort_tips(device, most_curvature, states, offsets, places, best, costs):
 
 @kernel()
 def first_free(walls, device, most_curvature, states, offsets, best, tips, near, places):
-    """Fill `tips` (G, TIP_COLUMNS) with the first proved tip of each group, and `near` with its tree point.
-
-    The tree point is -1 where none of a group is proved.
-    """
+    """Fill `tips` (G, TIP_COLUMNS) with each group's first proved tip; `near` gets tree points, -1: none."""
     scratch = np.zeros(12)
     for group in range(best.shape[0]):
         near[group] = -1
@@ -277,10 +271,8 @@ def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
 
 @inner_kernel
 def _spare(walls, radius, length, base, setting, far, growth, more):
-    """Return the largest change `D` of curvature for which the places of an arc have room, 0 if none has.
-
-    A place `s` mm from the base has to have (D / 2 + growth) s^2 mm.
-    """
+    """Return the largest change `D` of curvature at which all of an arc has (D / 2 + growth) s^2 mm; 0 if
+    none."""
     u = setting[1] / length * math.cos(setting[0])
     v = setting[1] / length * math.sin(setting[0])
     if room_along(walls, radius, base, u, v, 0.0, far, 0.5 * more + growth, LONGEST_MM) >= 0.0:

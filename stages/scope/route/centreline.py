@@ -147,7 +147,8 @@ def from_lung(lung: Lung) -> Centreline:
 
 
 def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
-    """Return the centreline of any branching tube: vein, artery or airway, without a root.
+    """Return the centreline of any branching tube, not zero in a mask: vein, artery or airway, without a
+    root.
 
     It is the skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels
     as solid boxes).  Raises AnatomyError if the mask is empty, or too small for a line.

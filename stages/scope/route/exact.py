@@ -112,10 +112,7 @@ def repaired(
 
 
 def segments(proof: Proof, n_control: int, margin: int, *, ends_free: bool) -> list[tuple[int, int]]:
-    """Return the ranges of control points to free for the spans that are not proved, widened and merged.
-
-    `margin` spans are added on both sides; the first and last control points move where the ends are free.
-    """
+    """Return control points to free for unproved spans and `margin` more, ends too where they are free."""
     lowest, highest = (0, n_control) if ends_free else (1, n_control - 1)
     found: list[tuple[int, int]] = []
     for span in proof.failed_spans.tolist():

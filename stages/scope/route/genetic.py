@@ -96,10 +96,7 @@ def repair_genetic(
 def cut_segments(
     tentative: Curve, centreline: Centreline, limits: RouteLimits, margin_share: float
 ) -> tuple[Float, list[Segment]]:
-    """Return the path points `(P, 3)` of a curve, and the runs of them that bend too much, widened.
-
-    Runs that then touch become one.
-    """
+    """Return the path points `(P, 3)` of a curve, and their runs that bend too much, widened and merged."""
     # The path points that are fitted and tested are 1 mm apart, about a voxel of a CT.
     count = max(round(tentative.length_mm()), 2 * DEGREE)
     parameters = np.linspace(tentative.breaks[0], tentative.breaks[-1], count + 1)

@@ -36,11 +36,7 @@ class GuidePath:
         return np.hstack((with_radius[:-1], with_radius[1:]))
 
     def curve(self, spacing_mm: float = WAYPOINT_SPACING_MM) -> Curve:
-        """Return the tentative curve: the cubic B-spline through points of the guide path.
-
-        Args:
-            spacing_mm: Distance of the points along the guide path, about; 0 for every point, as in [Li2021].
-        """
+        """Return the cubic B-spline through guide path points `spacing_mm` apart, all if 0 [Li2021]."""
         along = self.along_mm
         if spacing_mm <= 0.0:
             return interpolate(self.points_mm)

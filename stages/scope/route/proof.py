@@ -15,10 +15,7 @@ from stages.scope.route.kernels import spline as kernel
 
 @settings
 class RouteLimits:
-    """What the device can follow; the largest curvature is S of [Li2021].
-
-    With an end tolerance of 0 the route ends exactly at the wanted points.
-    """
+    """What the device can follow, S of [Li2021] as curvature; a tolerance of 0 makes the ends exact."""
 
     max_curvature_per_mm: Annotated[float, quantity("largest curvature", above=0.0, at_most=10.0)]
     device_radius_mm: Annotated[float, quantity("outer radius of the device", at_least=0.0, at_most=10.0)] = (
@@ -108,10 +105,7 @@ PER_SPAN = 16
 
 @frozen_value
 class RouteMetrics:
-    """Numbers of a curve, from dense samples: curvature, and distance to the wall, which is negative outside.
-
-    `normalised_length` is the length over the distance between the ends.
-    """
+    """Numbers from a curve's dense samples: curvature, wall distance (negative outside), length ratio."""
 
     normalised_length: float
     mean_curvature_per_mm: float

@@ -311,10 +311,7 @@ class Resistances:
 
 
 def branch_resistances(tree: AirwayTree, weights: Resistances) -> Float:
-    """Return the resistance of every branch of a tree, `(B,)`.
-
-    The angle is the one between the chord of a branch and that of its parent; that of the trachea is 0.
-    """
+    """Return the resistance of every branch `(B,)` of a tree, by angles of chords with the parent's."""
     first, last = tree.branch_start[:-1], tree.branch_start[1:] - 1
     hook = np.where(tree.parent_point[first] < 0, first, tree.parent_point[first])
     chord = tree.points_lps[last] - tree.points_lps[hook]

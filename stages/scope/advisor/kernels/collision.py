@@ -165,10 +165,7 @@ def body_fits(lumen, scope, state, alpha, beta, joints):
 
 @kernel()
 def measure(lumen, scope, states, fits, clearances):
-    """Fill for states (M, 14): whether the links fit, and the sum of clearances of Section IV-D.
-
-    The sum counts the base sphere of every link, link 0 among them, and the last end sphere.
-    """
+    """Fill for states (M, 14) whether the links fit, and the sum of clearances of links and tip (IV-D)."""
     joints = np.zeros((scope.links + 1, 3))
     for m in range(states.shape[0]):
         fits[m] = body_fits(lumen, scope, states[m], states[m, 12], states[m, 13], joints)

@@ -187,10 +187,7 @@ def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
 
 @inner_kernel
 def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints):
-    """Write the state after a sub-step towards a candidate; tell whether every pose looked at is free.
-
-    `looks` poses are looked at, evenly spaced in time, the last one being `out`.
-    """
+    """Write the state `out` after a sub-step to a candidate; tell if all its `looks` poses are free."""
     part = step / look_ahead
     alpha = state[12] + (row[TWIST] - state[12]) * part
     beta = state[13] + (row[BEND] - state[13]) * part

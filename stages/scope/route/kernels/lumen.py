@@ -91,11 +91,7 @@ def deep_enough(cones, index, cell_start, cell_cones, hint, enough, x, y, z):
 
 @inner_kernel
 def depth_at(cones, index, cell_start, cell_cones, x, y, z):
-    """Return the depth of a point in the lumen and the centre of its best ball.
-
-    Where the point lies in no cone that is listed for its cell, the depth may be `NOWHERE`: it is exact
-    where it is not negative, and never too large.
-    """
+    """Return the depth of a point in the lumen and the centre of its best ball, see `deep_enough`."""
     depth, cx, cy, cz, _cone = deep_enough(cones, index, cell_start, cell_cones, -1, math.inf, x, y, z)
     return depth, cx, cy, cz
 

@@ -97,10 +97,8 @@ def _depth_violation(program, s, v, multiplier, hints):
 
 @inner_kernel
 def _end_violation(program, control, end):
-    """Return the violation at an end, the vector from the wanted point, its length, and the control point.
-
-    A clamped spline ends at its first and last control points.  The control point is -1 if the end is held.
-    """
+    """Return the violation at an end, the vector from the wanted point, its length, and the control point, -1
+    if held."""
     a = 0 if end == 0 else control.shape[0] - 1
     if a < program.lo or a >= program.hi:
         return -1.0, 0.0, 0.0, 0.0, 0.0, -1
@@ -311,17 +309,11 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
 
 @kernel(nogil=True)
 def repair(control, program, rounds, steps, tolerance):
-    """Move the free control points to the solution of the program.
+    """Move the free control points of `control` (n, 3) to the solution of the program, in place.
 
-    Args:
-        control ((n, 3) float64): Changed in place.
-        program: lagrangian.Program.
-        rounds, steps (int): Updates of the multipliers, and least-squares steps in each.
-        tolerance (float): Largest violation that counts as none: a share of the limit of curvature, or of the
-            local radius.
-
-    Returns:
-        (float, int): The largest violation that is left, and the least-squares steps taken.
+    `rounds` and `steps` are updates of the multipliers, and least-squares steps in each.  Up to `tolerance` a
+    violation counts as none: a share of the limit of curvature, or of the local radius.  Returned are the
+    largest violation that is left, and the least-squares steps taken.
     """
     count = program.first.shape[0]
     n = 3 * (program.hi - program.lo)

@@ -33,20 +33,18 @@ if TYPE_CHECKING:
     from stages.needle.infeasibility.certificate import NoPathProof
     from stages.needle.infeasibility.passage import NOT_BOUNDED, Passage, backward_reach
     from stages.needle.kernels.cost import ObjectiveArrays
-    from stages.needle.kernels.proof import Limits, Obstacles, blocker_on_arc
+    from stages.needle.kernels.proof import Limits, Obstacles
     from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
         CURVATURE,
         LENGTH,
-        ROLL,
         ArcPath,
         Query,
         arc_transform,
         bend_direction,
         blocker_on_path,
         direct_path,
-        pose_at,
         violation,
     )
     from stages.needle.planner_choice import has_ompl, require_planner
@@ -62,28 +60,17 @@ if TYPE_CHECKING:
         ReachScan,
         StartIndex,
     )
-    from stages.needle.replanning.insertion import Belief, Commands, TrueNeedle, Unknown, steer, tilt
-    from stages.needle.replanning.replanner import (
-        DEFAULT_SETTINGS,
-        ITERATIONS,
-        Failure,
-        Replan,
-        Replanner,
-        ReplanSettings,
-        structure_name,
-        with_limits,
-        with_reserve,
-    )
+    from stages.needle.replanning.insertion import Belief, Commands, TrueNeedle, Unknown, steer
+    from stages.needle.replanning.replanner import Failure, Replan, Replanner, ReplanSettings
     from stages.needle.search.base import RestartingRRT, Search, first_path
     from stages.needle.search.decision import Decision
     from stages.needle.search.optimal import OptimalSearch
-    from stages.needle.search.planners import MakeSearch, searches
+    from stages.needle.search.planners import searches
     from stages.needle.search.portfolio import PortfolioSearch, successive_halving
-    from stages.needle.search.resolution import Cells, Outcome, Resolution, ResolutionSearch
+    from stages.needle.search.resolution import Outcome, Resolution, ResolutionSearch
     from stages.needle.start_region import (
         KINDS,
         REACHING,
-        ProvedStarts,
         StartRegion,
         TriedStarts,
         prove_starts,

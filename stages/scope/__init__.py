@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         in_tip_region,
         prove_motion,
         prover_of,
-        shifted,
     )
     from stages.scope.motions import Passages, ScopeMotions, ScopeTip, find_motions, find_passages
     from stages.scope.resting import RestingShaft, RestingShape, WallContact, lumen_of

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         join_deployments,
     )
     from stages.tube.design_shapes import (
-        ShapeTree,
         coarser_shapes,
         longest_mm,
         open_shapes,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
     from stages.tube.mechanics import Batch, TubeMechanics
     from stages.tube.one_shape import (
         DEFAULT_ROTATIONS,
-        NearbyShape,
         Neighbourhood,
         copies,
         deployed,

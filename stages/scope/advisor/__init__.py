@@ -8,32 +8,15 @@ if TYPE_CHECKING:
     from stages.scope.advisor.advisor import (
         Advice,
         Advisor,
-        PathSearch,
         PathSettings,
         ThinnerScope,
         start_state,
         why_stopped,
     )
-    from stages.scope.advisor.best_motion import (
-        Candidates,
-        Motion,
-        MotionEvaluation,
-        Weights,
-        evaluate_motions,
-    )
-    from stages.scope.advisor.environment import ScopeEnvironment
-    from stages.scope.advisor.kinematics import (
-        ScopeModel,
-        ScopeState,
-        advanced,
-        joints,
-        model_of,
-        straight_state,
-        tip_frames,
-        tool_frames,
-    )
-    from stages.scope.advisor.lumen import Lumen, lumen_of_lung, lumen_of_mask
-    from stages.scope.advisor.nf1 import Goal, NavigationField, goal_at, navigation_field
+    from stages.scope.advisor.best_motion import Candidates, Motion, MotionEvaluation, Weights
+    from stages.scope.advisor.kinematics import ScopeModel, ScopeState, model_of
+    from stages.scope.advisor.lumen import Lumen, lumen_of_lung
+    from stages.scope.advisor.nf1 import Goal, NavigationField, goal_at
     from stages.scope.advisor.path import (
         MARKUPS_SCHEMA,
         FlyThrough,

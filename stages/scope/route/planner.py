@@ -176,21 +176,10 @@ class Replanner:
         self._nodes = position[route.nodes]
         self._edges = position[self._edges]
 
-    def replan(
-        self,
-        nodes_mm: ArrayLike,
-        *,
-        radius_mm: ArrayLike | None = None,
-        start_mm: ArrayLike | None = None,
-        goal_mm: ArrayLike | None = None,
-    ) -> Route:
-        """Return the route for the centreline with its nodes at new places.
+    def replan(self, nodes_mm: ArrayLike) -> Route:
+        """Return the route for the centreline with all its nodes `(N, 3)` at new places, LPS mm.
 
-        Args:
-            nodes_mm ((N, 3) float64): All nodes of the centreline, in its order, LPS mm.
-            radius_mm ((N,) float64): New radii; the old ones if None.
-            start_mm, goal_mm ((3,) float64): Where the tip is, and the goal; the old ones, moved along with
-                the nearest node, if None.
+        Start and goal move along with the nodes nearest to them.
 
         Raises:
             NoRouteError, TargetError: As `plan_route`.
@@ -201,12 +190,9 @@ class Replanner:
             raise SettingsError(
                 f"{moved.shape[0]} nodes were given for a centreline of {old.n_nodes}", expected="all nodes"
             )
-        radius = old.radius_mm if radius_mm is None else np.asarray(radius_mm, dtype=np.float64)
-        here = Centreline(nodes_mm=moved[self._kept], radius_mm=radius[self._kept], edges=self._edges)
-        ends = [
-            self._carried(end, moved) if given is None else np.asarray(given, dtype=np.float64)
-            for end, given in ((0, start_mm), (-1, goal_mm))
-        ]
+        radius = old.radius_mm[self._kept]
+        here = Centreline(nodes_mm=moved[self._kept], radius_mm=radius, edges=self._edges)
+        ends = [self._carried(end, moved) for end in (0, -1)]
         limits = self._route.limits
         for point, name in zip(ends, ("start", "goal"), strict=True):
             here.require_inside(point, limits.needed_mm, name)

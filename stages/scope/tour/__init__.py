@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from stages.scope.tour.subtree import (
         MOST_COMBINATIONS,
         MOST_LESIONS,
-        SAME_RESISTANCE,
         Circuits,
         Exit,
         ExitRule,
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
         Reading,
         Resistances,
         Subtree,
-        branch_resistances,
         circuits,
         combinations,
         exits_of,

@@ -50,16 +50,10 @@ def least_length(rho, h, limits, cosine, turn_left):
     """Return a length below which no path leads into the ball, inf if none does within the turning limits.
 
     Nothing within the limits is ruled out, and no length stated that a path could do without
-    (docs/theory/proofs.md, "Workspace").  The limit of the angle counts where no tangent of a path can
-    lean from the tip by more than 90 degrees: else a tilted tip can wind around the reference, and reaches
-    farther than by one arc.  The turn that is left counts up to 180 degrees.
-
-    Args:
-        rho, h (float): How far the goal is aside and ahead, mm.
-        limits: Limits.
-        cosine (float): Cosine of the angle between the tip and the direction from which the limit of the
-            angle counts.
-        turn_left (float): What is left of the accumulated turn, rad.
+    (docs/theory/proofs.md, "Workspace").  The limit of the angle, from a direction of which `cosine` is that
+    of the angle to the tip, counts where no tangent of a path can lean from the tip by more than 90 degrees:
+    else a tilted tip can wind around the reference, and reaches farther than by one arc.  What is left of the
+    accumulated turn, `turn_left` rad, counts up to 180 degrees.  The goal is `rho` mm aside and `h` mm ahead.
     """
     tolerance = limits.goal_tolerance_mm
     kappa = limits.kappa

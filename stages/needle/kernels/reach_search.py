@@ -52,16 +52,12 @@ def reach_by_search(
     """Search paths of several arcs to the points that no single arc reaches.
 
     From every start pose with the point in its workspace, the shortest path is tried; if none is clear, an
-    RRT from the first `trees` of them in the mixed order.
+    RRT from the first `trees` of them in the mixed order.  What is not stated is as in
+    `reach_arcs.reach_by_arcs`; points found become SEARCHED.
 
     Args:
-        obstacles, limits, objective, starts, branches, order, points: See `reach_arcs.reach_by_arcs` and
-            `cost`.
-        trees, iterations, share (int, int, float): Trees for each point, and iterations and share of random
-            arcs of each.
+        iterations, share (int, float): Iterations of each tree, and their share of random arcs.
         seeds ((N,) uint64): Seed of each point, so that points may be searched in any order.
-        nodes, parents, picked (arrays): Scratch: a tree, and `trees` int64.
-        kinds, found, entries (arrays): As `reach_arcs.reach_by_arcs` left them; points found become SEARCHED.
 
     Returns:
         int: The row of `nodes` at the last point that was searched, 0 if it was not found.

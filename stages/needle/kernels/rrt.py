@@ -106,19 +106,15 @@ def grow_rrt(
 ):
     """Grow the tree of [Kuntz2015, sec. IV-C] by up to `iterations` samples, until it reaches the goal.
 
-    From the root and after every new node, the goal is tried.  A goal nearer than MIN_ARC_MM to the start
-    is no problem to solve: nothing is grown.
+    From the root and after every new node, the goal is tried.  A goal nearer than MIN_ARC_MM to the start is
+    no problem to solve: nothing is grown.
 
     Args:
-        obstacles, limits, objective: Obstacles, Limits, ObjectiveArrays.
         branch (int): Pierced branch, whose wall is exempt at the exit; -1 for none.
-        goal: (3,) float64, LPS mm.
         nodes ((M, NODE_COLUMNS) float64, parents : (M,) int64): The tree; row 0 is the start pose, `count`
             rows are in use.
-        iterations: int.
         random_share (float): Share of the iterations that extend a random node by a random arc, so that every
             path has a chance; the others draw a point, and extend the node nearest to it.
-        state ((1,) uint64): Random state.
         best (float): Paths that cost as much are not looked for.
 
     Returns:

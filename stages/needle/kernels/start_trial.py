@@ -45,7 +45,7 @@ def try_starts(
     obstacles, limits, objective, branch, positions, tangents, vias, goal, iterations, share, seed, nodes,
     parents, kinds,
 ):  # fmt: skip
-    """Try the single arc from each start pose, then paths through via points, then an RRT.
+    """Try the single arc from each start pose `(N, 3)`, then paths through via points, then an RRT.
 
     Before the via points comes the shortest path in free space; through each leads a single arc, and from
     there an arc or the shortest path.

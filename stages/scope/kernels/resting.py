@@ -323,7 +323,8 @@ def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
 def bring_to_rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
     """Bring a shaft to rest: `curvature` (N, 2) becomes that of a shape of least energy.
 
-    Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps.
+    Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps. A
+    step that is expected to lower the energy by less than `enough`, N mm, is not taken any more.
 
     Args:
         entry, frames ((12,), (N + 1, 12) float64): Frame in which the shaft begins; becomes those of arcs'

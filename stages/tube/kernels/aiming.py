@@ -98,13 +98,8 @@ def aim_shape(design, near, shape, base, target):
     """Turn and insert tubes so that their tip comes to a point.
 
     Newton's method with the least change of the joints in each step, from the shape `near`, which is changed.
-    Then the whole way is followed.
-
-    Args:
-        design: DesignArrays.
-        near, shape (ShapeArrays): The second receives the shape.
-        base ((9,) float64): Scope tip: point, tangent, and +x, from which the rotation counts.
-        target: tuple of 3 floats.
+    Then the whole way is followed, and `shape` receives it.  `base` (9,) is the scope tip: point, tangent,
+    and +x, from which the rotation counts.
 
     Returns:
         - rotation, miss (float) - Of all tubes together in rad; the distance of the tip from the point in mm.

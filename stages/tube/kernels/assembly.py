@@ -56,12 +56,10 @@ def _breakpoints(lengths, bends, beta, found):
 def cut(design, beta, step, pieces, moments, directions):
     """Cut the tubes ahead of the front plate into pieces; return their number and that of all steps.
 
-    The last piece ends where the last tube does, even if a straight body goes on.
+    The last piece ends where the last tube does, even if a straight body goes on.  A step spans at most the
+    angle `step`, in rad of the fastest torsional oscillation of a piece.
 
     Args:
-        design, beta: See the module.
-        step (float): Largest angle, in rad of the fastest torsional oscillation of a piece, that one step may
-            span.
         pieces ((1 + b + 2 m, PIECE_COLUMNS + b) float64): Is filled, the nearest piece first.
         moments, directions ((1 + b + 2 m, n) float64): Are filled: bending stiffness times precurvature in N
             mm of each tube in each piece, 0 where it is straight or not there, and the direction of the

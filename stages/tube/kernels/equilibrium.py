@@ -290,14 +290,9 @@ def scratch_for(n_steps, n, columns):
 def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, results):
     """Solve many configurations; `tip_angles` (M, n) holds guesses and gets the answers.
 
-    Args:
-        design (tuple): See `assembly`.
-        base_angles ((M, n) float64): rad.
-        beta ((M, b) float64): mm, of the tubes and then of straight bodies in them.
-        step (float): See `assembly.cut`.
-        prefer_stable (bool): See `settle`.
-        results ((M, RESULT_COLUMNS) float64): Is filled: see the columns; the tip frame is that of the first
-            tube's material.
+    Base angles `(M, n)` are in rad; `beta` `(M, b)`, mm, is of the tubes and then of straight bodies in them.
+    See `settle` for what is preferred.  `results` (M, RESULT_COLUMNS) is filled; the tip frame is that of the
+    first tube's material.
     """
     n = base_angles.shape[1]
     pieces, moments, directions = cutting_scratch(design, n)

@@ -63,14 +63,9 @@ class DesignArrays(NamedTuple):
 
 
 class ShapeArrays(NamedTuple):
-    """One deployment for the kernels, to be filled by them.
+    """One deployment for the kernels, to be filled by them: joints (2 n,), result (SHAPE_COLUMNS,), arcs.
 
-    Args:
-        joints: (2 n,) float64.
-        tips ((n,) float64): Angles at the tubes' own ends.
-        result: (SHAPE_COLUMNS,) float64.
-        arcs: (rows, ARC_COLUMNS) float64.
-        number ((1,) int64): How many of the rows are in use.
+    `tips` (n,) are angles at the tubes' own ends; `number` (1,) tells how many rows of the arcs are in use.
     """
 
     joints: Float

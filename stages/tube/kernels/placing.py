@@ -25,15 +25,10 @@ PLACED_SHAPE, PLACED_BRANCH, PLACED_EXIT, PLACED_ANGLE, PLACED_RUN, PLACED_COLUM
 
 @kernel()
 def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
-    """Cut one shape into stretches between stops; return how many stretches there are.
+    """Cut one shape into stretches between stops, `stop` mm apart; return how many stretches there are.
 
-    Args:
-        arcs: (a, ARC_COLUMNS) float64.
-        stop (float): Spacing of the stops, mm.
-        stretches ((rows, STRETCH_COLUMNS) float64): Is filled; a stop may have several.
-        ends, middles ((K + 1, 3) float64): Are filled: where the stretch before each stop ends, and its
-            middle.
-        radii ((K + 1,) float64): Is filled: the outermost radius of the stretch before each stop.
+    The stretches (rows, STRETCH_COLUMNS) are filled; a stop may have several.  For the stretch before each of
+    K + 1 stops are filled where it ends, its middle `(K + 1, 3)`, and the outermost radius there.
     """
     pose, across = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
     rows, at, place = 0, 0.0, 1
@@ -201,16 +196,11 @@ def _place_turned(environment, tubes, frame, tree, wanted, reasons, traces, plac
 def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed, counts):
     """Follow shapes from one scope tip with T rotations of all tubes together.
 
-    Args:
-        environment: TubeEnvironment.
-        tubes ((N_TUBES,) float64): Only the limits at the wall are looked at.
-        frames ((T, 4, 4) float64): The scope tip, with +x where the tubes are turned to.
-        tree (tuple): See `stages.tube.design_shapes.ShapeTree.with_margin`.
-        wanted ((T, S) bool): Which shapes are looked at.
-        reasons ((N_REASONS,) int64): Counts refused shapes by reason.
-        traces ((depths + 1, N_TRACE) float64): Scratch.
-        placed ((T S, PLACED_COLUMNS) float64): Receives the shapes that fit, one rotation after the other.
-        counts ((T,) int64): Receives how many fit with each rotation.
+    Of the tubes only the limits at the wall are looked at.  The tree is that of
+    `stages.tube.design_shapes.ShapeTree.with_margin`, of which the `wanted` (T, S) are looked at from
+    `frames` (T, 4, 4), the scope tip with +x where the tubes are turned to.  `reasons` counts the refused
+    shapes; `placed` (T S, PLACED_COLUMNS) receives those that fit, one rotation after the other, and `counts`
+    (T,) how many.
     """
     total = 0
     for t in range(frames.shape[0]):

@@ -109,14 +109,11 @@ def insertions_exist(tubes, insertions, outer, half_outer, inner, half_inner):
 
 @kernel(nogil=True)
 def greatest_insertions(tubes, longest, spacing, insertions):
-    """Find how far the inner tube may come out before it sweeps sideways too far.
+    """Find how far the inner tube may come out before it sweeps sideways too far, up to `longest` mm.
 
-    Args:
-        tubes: (N_TUBES,) float64.
-        longest (float): Greatest insertion at all, mm.
-        spacing (float): Of the insertions that are tried; what lies between is bounded, mm.
-        insertions ((N,) float64): `insertions[m]` receives a length, mm, that is at least the greatest
-            allowed one with the outer tube at m INSERTION_STEP_MM to (m + 1) INSERTION_STEP_MM.
+    Insertions `spacing` mm apart are tried; what lies between is bounded.  `insertions[m]` receives a length,
+    mm, that is at least the greatest allowed one with the outer tube at m INSERTION_STEP_MM to (m + 1)
+    INSERTION_STEP_MM.
     """
     curved = tubes[CURVED_LENGTH]
     most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))

@@ -367,17 +367,11 @@ def follow_all(
 
 @kernel(nogil=True)
 def arcs_near(design, radii, base, beta, turn, end, step, tip_angles, result, arcs):
-    """Lay the arcs of any joint values, reached straight from a deployment nearby.
+    """Lay the arcs of any joint values, reached straight from a deployment nearby; see `follow_all`.
 
-    Args:
-        design, radii, step: See `follow_all`.
-        base, tip_angles ((n,) float64): Rotation of the rear ends and angles at the own ends of the
-            deployment nearby; the last are changed to those of the new one.
-        beta, end ((b,) float64): Where the rear ends are, and where they are then.
-        turn ((n,) float64): By how much the rear ends turn on.
-        result ((SHAPE_COLUMNS,) float64): Is filled: the least determinant from there on, the error of the
-            arcs, the length and the tip.
-        arcs ((rows, ARC_COLUMNS) float64): Is filled.
+    The rear ends of that deployment turn on by `turn` (n,) and go from `beta` to `end` (b,); `tip_angles`
+    (n,) at the own ends are changed to those of the new one.  `result` is filled with the least determinant
+    from there on, the error of the arcs, the length and the tip.
 
     Returns:
         int: Number of arcs, 0 if the tubes snap on the way, -1 if there is no room.

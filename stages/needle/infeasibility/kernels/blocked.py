@@ -38,7 +38,7 @@ def _probed_at(v, u, window, scale, depth):
 
 @kernel(nogil=True)
 def mark_probed(states, window, scale, depths, probed, corners):
-    """Set the bits of the cells that the tangents of a plane's states meet at some depths.
+    """Set the bits of the cells that the tangents of a plane's states meet at depths `(D,)` from it, mm.
 
     Seen from the plane these are `depths` (D,) mm; `probed` (D, Y', W') uint64 receives the bits, and
     `corners` (D, 2) int64 are cell numbers (y, x) of the first cell of each.

@@ -132,7 +132,7 @@ def test_cut_the_anatomy_along_the_needle(planned: Page) -> None:
     planned.run(
         "const e = document.getElementById('cut-offset'); e.value = 5; e.dispatchEvent(new Event('input'))"
     )
-    assert planned.state()["view_tools"]["cut"]
+    planned.wait("s.view_tools.cut")
     assert "5 mm" in planned.text("cut-words")
     planned.click("cut")
 

@@ -289,7 +289,7 @@ def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hes
 
 @inner_kernel
 def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
-    """Lay the shaft anew with steps of a size, each arc answering to its begin; return the longest way."""
+    """Lay the shaft anew in steps of a size, each arc answering to its begin; return the longest way, mm."""
     to_frames[0] = frames[0]
     longest = 0.0
     for n in range(curvature.shape[0]):

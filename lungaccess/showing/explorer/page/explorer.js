@@ -58,9 +58,11 @@ class ExplorerPage extends DevicePage {
     this.asker = new Asker();
     await this.asker.connect();
     say("Reading the patient…");
-    await this.asker.ask("patient", {}, (facts) => this.takePatient(facts));
+    const patient = await this.asker.ask("patient", {}, (facts) => this.takePatient(facts));
+    if (patient.answer === "error") return;
     say("Loading the anatomy…");
-    await this.asker.ask("scene", {}, (part) => this.takeScene(part));
+    const scene = await this.asker.ask("scene", {}, (part) => this.takeScene(part));
+    if (scene.answer === "error") return;
     this.listStructures();
     this.connectControls();
     say("Ready. Click into a slice, or pick a nodule.");

@@ -137,10 +137,7 @@ class OrderedTubes:
 
     @cached_property
     def body(self) -> Any:
-        """Function: tip angles (n,) rad, beta (n,) mm -> (3 + n, N) from the tip on.
-
-        Arc lengths and points, mm, and the angles of the tubes but the innermost, relative to it, rad.
-        """
+        """Function: tip angles (n,) rad, beta (n,) mm -> `(3 + n, N)` from tip, as `CasadiTubes.body`."""
         tip, beta = self._symbols("tip_angles_rad")
         passed: list[Any] = []
         _, position, rotation = self._integrate(tip, beta, passed)
@@ -177,10 +174,8 @@ class OrderedTubes:
         return angles + beta * rates, -rotation @ state[POSITION], rotation
 
     def _step(self, passed: Sequence[int]) -> Any:
-        """Return the Runge-Kutta step in a piece: state, step in mm -> state.
-
-        `passed` counts the landmarks of each tube between the piece and the tip.
-        """
+        """Return the Runge-Kutta step, state and mm -> state, in a piece that has `passed` landmarks of each
+        tube ahead."""
         state, length = casadi.SX.sym("state", FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
         bending, rest = [], []
         for tube, marks, count in zip(self._tubes, self._marks, passed, strict=True):

@@ -332,10 +332,7 @@ def derive_arrival(
 def derive_inserted(
     tubes: Sequence[Tube], needle: Tube, rotations_rad: ArrayLike, insertions_mm: ArrayLike, needle_mm: float
 ) -> Float:
-    """Return the frame `(4, 4)` of the tubes' tip with a needle whose tip is `needle_mm` beyond it.
-
-    Errors are those of `derive_arrival`.
-    """
+    """Return the tubes' tip frame `(4, 4)`, the needle `needle_mm` beyond it; errors as `derive_arrival`."""
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)
     beta = out - [tube.length_mm for tube in tubes]
@@ -343,10 +340,7 @@ def derive_inserted(
 
 
 def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Float) -> tuple[Float, float]:
-    """Follow the rear ends from `begin` to `end`, in parts of the step where the tips turn fast.
-
-    Returns the tip angles there, and the least determinant.
-    """
+    """Follow the rear ends from `begin` to `end`; return the tip angles there, and the least determinant."""
     done, share, least = 0.0, 1.0, 1.0
     while done < 1.0:
         to = min(done + share, 1.0)

@@ -295,10 +295,7 @@ def _joined(parts: list[Deployments], first_site: Int) -> Deployments:
 
 
 def exit_points(tubes: ConcentricTubes, scope_tips: Float, deployments: Deployments, chosen: Int) -> Float:
-    """Return the points `(N, 3)` LPS mm at which the axes of deployments `(N,)` leave the lumen for good.
-
-    `scope_tips` `(S, 9)` are point, direction and +x of each tip, LPS mm; `deployments.site` counts them.
-    """
+    """Return points `(N, 3)` LPS mm where deployments leave the lumen for good, from scope tips `(S, 9)`."""
     tips, at_mm = scope_tips[deployments.site[chosen]], deployments.exit_mm[chosen]
     rotations = deployments.rotation_rad[chosen]
     shapes, points = shapes_of(tubes), np.zeros((len(chosen), 3))

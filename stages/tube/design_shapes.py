@@ -206,10 +206,7 @@ def coarser_shapes(shapes: TubeShapes, stop_mm: float) -> tuple[Int, TubeShapes,
 
 
 def shapes_digest(tubes: ConcentricTubes) -> str:
-    """Return a hash of the shapes of a design.
-
-    Shapes near a limit may be in the set on one machine and not on another.
-    """
+    """Return a hash of a design's shapes; one near a limit may be there on one machine and not on another."""
     shapes = shapes_of(tubes)
     parts = (shapes.insertions_mm, shapes.rotations_rad, shapes.arcs, shapes.first_arc)
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()

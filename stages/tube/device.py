@@ -389,10 +389,7 @@ class ConcentricTubes:
         return self.inner.length_mm - (0.0 if self.outer is None else self.outer.length_mm)
 
     def with_needle(self, shaft: Tube | None) -> "ConcentricTubes":
-        """Return the same tubes with a straight needle whose tip stays at that of the inner tube.
-
-        It belongs to the system and not to the tubes, so no file states it among them.
-        """
+        """Return the tubes with a straight needle kept at the inner tip; no file states it among them."""
         made = replace(self)
         object.__setattr__(made, "needle_shaft", shaft)
         return made
@@ -415,10 +412,7 @@ class ConcentricTubes:
         return self._shared_curvature()
 
     def _shared_curvature(self, *around: Tube) -> float:
-        """Return the curvature of the inner tube's bent part with a needle in it and others around it, 1/mm.
-
-        They share the precurvature in proportion to their bending stiffness [Rucker2010].
-        """
+        """Return the bent inner tube's curvature in others, 1/mm, shared by bending stiffness [Rucker2010]."""
         straight = around if self.needle_shaft is None else (self.needle_shaft, *around)
         inner, *others = (float(tube.parts.stiffness_n_mm2[0]) for tube in (self.inner, *straight))
         return self.inner.precurvature_per_mm * (inner / (inner + sum(others)))

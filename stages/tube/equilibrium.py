@@ -21,10 +21,7 @@ SAME_MM = 1e-9
 
 
 class NestedTubes:
-    """Nested tubes, the innermost first, cut into pieces of constant stiffness and precurvature.
-
-    Parameters and errors are those of `TubeMechanics`.
-    """
+    """Nested tubes as for `TubeMechanics`, in pieces of constant stiffness and precurvature."""
 
     def __init__(
         self,
@@ -180,10 +177,7 @@ class Equilibrium:
         return np.asarray(self.frames(arc_lengths_mm)[:, :3, 3])
 
     def angles(self, arc_lengths_mm: ArrayLike) -> Float:
-        """Return rotations `(N, n)` of the tubes' material against the Bishop frame, rad.
-
-        NaN where a tube is not: ahead of its end and behind its rear end.
-        """
+        """Return rotations `(N, n)` of tubes against the Bishop frame, rad; NaN where a tube is not."""
         s = self._arc_lengths(arc_lengths_mm)
         _poses, psi, rates = self._along(s)
         behind = np.minimum(s, 0.0)[:, None]

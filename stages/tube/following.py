@@ -187,10 +187,7 @@ def _step(
 
 
 def motion_by_step(steps: SequenceOf[Equilibrium]) -> tuple[Float, Float]:
-    """Return (K,) sideways sweep and (K,) follow-the-leader error of the steps of a deployment, in mm.
-
-    Both compare the body of each step, from the scope tip to its own tip, with the last step.
-    """
+    """Return (K,) sideways sweep and (K,) follow-the-leader error of steps against the last one, in mm."""
     final = steps[-1]
     arcs = [_samples(step.length_mm) for step in steps]
     bodies = np.concatenate([step.backbone(arc) for step, arc in zip(steps, arcs, strict=True)])

@@ -50,10 +50,7 @@ def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
 
 
 def tube_constants(tubes: ConcentricTubes, margins: Margins) -> Float:
-    """Return the `(N_TUBES,)` array of `stages.tube.kernels.planar`, lengths in mm, angles in rad.
-
-    Curvatures and the length of the curve are 0 where the tubes are not planar.
-    """
+    """Return `(N_TUBES,)` of `stages.tube.kernels.planar`, mm and rad, 0 for curves that are not planar."""
     constants = np.zeros(kernels.N_TUBES)
     inner, outer = tubes.inner, tubes.outermost
     if tubes.planar:
@@ -200,10 +197,7 @@ ROOM = 4 * columns.MOST_ARCS
 
 @frozen_record
 class NearbyShape:
-    """A deployment of any joint values; see `TubeShapes` for its fields.
-
-    The least determinant is that of the way from the deployment nearby.
-    """
+    """A deployment with fields as `TubeShapes`; the least determinant is that of the way from nearby."""
 
     insertions_mm: Float
     rotations_rad: Float

@@ -98,10 +98,7 @@ def _makers(
 
 @settings
 class MakerLimits:
-    """What limits the maker of a pair of tubes.
-
-    With 0 the curved part of the inner tube is as long as the larger of its insertion and its present length.
-    """
+    """What limits a maker of tubes; 0 curves the inner one for the larger of insertion and present length."""
 
     channel_diameter_mm: Annotated[float, quantity("working channel of the scope", above=0.0, at_most=10.0)]
     longest_curve_mm: Annotated[

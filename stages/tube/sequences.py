@@ -104,10 +104,7 @@ def kuntz2015(
 def inner_first(
     tubes: collections.abc.Sequence[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
 ) -> Sequence:
-    """Turn in the scope, insert the innermost tube wholly, then each next one over it.
-
-    Parameters and errors are those of `together`. The inner tubes must be long enough to be out alone.
-    """
+    """As `together`, but each tube goes in wholly before the next; the innermost is long enough to."""
     insertions = _insertions(tubes, insertions_mm)
     numbers = np.arange(len(insertions))
     moves = [
@@ -128,10 +125,7 @@ def alternating(
     *,
     increment_mm: float = DEFAULT_INCREMENT_MM,
 ) -> Sequence:
-    """Turn in the scope, then insert by increments in turns, the innermost tube ahead.
-
-    A tube moves by an increment before it is the next one's turn.  All else is as with `together`.
-    """
+    """As `together`, but tubes go in by increments in turns, the innermost tube ahead."""
     if not 0.0 < increment_mm < np.inf:
         raise SettingsError(f"The increment is {increment_mm:g} mm", expected="a finite length above 0")
     insertions = _insertions(tubes, insertions_mm)

@@ -250,10 +250,8 @@ def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
 
 
 def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
-    """Return all deployments as indices of stops `(S, n)`, and of each the one a step before `(S,)`.
-
-    The tubes that are farthest out go back together, with flush tips.
-    """
+    """Return deployments as indices of stops `(S, n)`, and the one before `(S,)`: the farthest tubes go back
+    together."""
     lengths, n = mechanics.lengths_mm, mechanics.count
     of: dict[tuple[int, ...], int] = {}
     states: list[tuple[int, ...]] = []

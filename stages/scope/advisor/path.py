@@ -240,8 +240,7 @@ def _place(from_carina_mm: float) -> str:
 
 
 def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, ...]:
-    """Return what to do branch by branch, by the tree point nearest to the tip, as far as nearest to the
-    goal."""
+    """Return what to do branch by branch, by the tree point nearest to the tip, to the nearest state."""
     tips = path.tips()[: path.nearest + 1, :3, 3]
     # For each tip the nearest tree point on the route to the last one, never going back.
     route = tree.route(tree.nearest_point(tips[-1]))

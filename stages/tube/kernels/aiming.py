@@ -1,8 +1,4 @@
-"""Joint values with which the tip of the tubes comes to a point.
-
-The common rotation turns the tip to the side where the point is; the other joints bring it to the point's
-distance beside and ahead of the scope tip.
-"""
+"""Joint values with which the tip of the tubes comes to a point: a common rotation, then the other joints."""
 
 import math
 
@@ -48,10 +44,7 @@ def _tip(shape):
 
 @inner_kernel
 def _change(design, near, shape, want_aside, want_ahead, change):
-    """Write the least change of the joints that makes up for a tip's distance; tell whether there is one.
-
-    Where the tip goes with each joint is seen from the frames of the mechanics, which change smoothly.
-    """
+    """Write the least change of the joints that makes up for a tip's distance; tell whether there is one."""
     n = design.radii.shape[0]
     here = near.result[TIP + 9 :]
     aside = math.hypot(here[0], here[1])
@@ -95,7 +88,7 @@ def _change(design, near, shape, want_aside, want_ahead, change):
 
 @merged_kernel
 def aim_shape(design, near, shape, base, target):
-    """Turn and insert tubes so that their tip comes to a point.
+    """Turn and insert tubes so that their tip comes to a point `target`.
 
     Newton's method with the least change of the joints in each step, from the shape `near`, which is changed.
     Then the whole way is followed, and `shape` receives it.  `base` (9,) is the scope tip: point, tangent,

@@ -41,11 +41,7 @@ CONVERGED, STABLE, LEAST_DETERMINANT, RESIDUAL, TIP, RESULT_COLUMNS = 0, 1, 2, 3
 
 @inner_kernel
 def _relative(dpsi, drate, at, beta, s, matrix):
-    """Fill `matrix` (n - 1, n - 1) with how angles between the tubes at `s` depend on those at the tip.
-
-    Behind the front plate every tube goes on with constant torsion as far as its own rear end; `at` is the
-    node that `s` is counted from.
-    """
+    """Fill `matrix` (n - 1, n - 1) with how angles between the tubes at `s` depend on those at the tip."""
     last = matrix.shape[0]
     for i in range(last):
         for c in range(last):
@@ -103,10 +99,8 @@ def _least_behind(dpsi, drate, beta, matrix, right):
 
 @merged_kernel
 def _turns_back(dpsi, drate, beta, at, matrix, before, right):
-    """Tell whether two directions in which the tubes can turn lose stability together within one step.
-
-    Then the determinant changes sign twice; the trace of the step's own matrix shows it.
-    """
+    """Tell, by the trace of the step's own matrix, whether two ways of turning lose stability within one
+    step."""
     last = matrix.shape[0]
     trace = 0.0
     if last == 2:
@@ -176,10 +170,7 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
 
 @inner_kernel
 def newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, enough):
-    """Let Newton's method find tip angles for base angles from a guess; return the last error, rad.
-
-    It stops where the error is below `enough`.
-    """
+    """Let Newton's method find tip angles from a guess, to `enough` of an error; return the last one, rad."""
     worst = math.inf
     for _ in range(NEWTON_STEPS):
         twist(design, cutting, tip_angles, nodes, steps)
@@ -214,10 +205,8 @@ def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, mat
 
 @merged_kernel
 def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
-    """Start from angles all round until a stable equilibrium is found; return the last error, rad.
-
-    If all that are found are unstable, the first of them is taken.
-    """
+    """Start from angles all round until an equilibrium is stable, else take the first; return the last error,
+    rad."""
     n = tip_angles.shape[0]
     any_found = math.inf
     kept = base_angles.copy()

@@ -108,10 +108,7 @@ def in_order(design, joints):
 
 @inner_kernel
 def near_shape(design, near, shape):
-    """Fill the tips, error and arcs of `shape` at its joints, reached straight from a deployment nearby.
-
-    Returns whether there is such a shape; neither its sweep nor its strain is judged.
-    """
+    """Fill tips, error and arcs of `shape` at joints near another; tell if there is one, limits aside."""
     n = design.radii.shape[0]
     if not in_order(design, shape.joints):
         return False

@@ -91,10 +91,7 @@ def sweep_slope(bend):
 
 @inner_kernel
 def insertions_exist(tubes, insertions, outer, half_outer, inner, half_inner):
-    """Tell whether ranges (middle and half width) hold insertions that are possible and sweep little.
-
-    `insertions` is the table of `greatest_insertions`.
-    """
+    """Tell whether ranges (middle, half width) hold insertions within the table of `greatest_insertions`."""
     low_outer, high_outer = outer - half_outer, outer + half_outer
     low_inner = inner - half_inner
     if low_outer > inner + half_inner or low_inner - high_outer > tubes[MAX_PROTRUSION]:

@@ -77,10 +77,7 @@ def turned(pose, angle, out):
 
 @inner_kernel
 def curvature(cutting, k, share, h, psi, rate, at):
-    """Return the curvature (x, y) of the centreline at a share of the step ahead of node `at`, 1/mm.
-
-    It is in the Bishop frame; angles within the step lie on the cubic through angles and rates at its ends.
-    """
+    """Return Bishop curvature (x, y) at a share of the step ahead of node `at`, 1/mm, angles on a cubic."""
     pieces, moments, directions, _count = cutting
     t2, t3 = share * share, share * share * share
     a = 1.0 - 3.0 * t2 + 2.0 * t3

@@ -80,10 +80,8 @@ def _reason(label):
 
 @merged_kernel
 def _wall_normal(labels, geometry, x, y, z):
-    """Return the outward unit normal of the lumen at a border point, in corner axes scaled to mm.
-
-    It points away from the centroid of the lumen within NORMAL_RADIUS_MM.
-    """
+    """Return the lumen's outward unit normal at a border point, away from its centroid nearby, in corner
+    axes, mm."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
@@ -219,10 +217,8 @@ def refused_exits(tubes, s, lack, first_outer):
 
 @merged_kernel
 def _run_in_wall(environment, pose, bend, begin, end, radius):
-    """Return how much of a stretch is nearer to an airway than `radius`: at least the true length.
-
-    Other branches than the pierced one are farther away than that.
-    """
+    """Return how much of a stretch, at least, is nearer to an airway than `radius`; other branches are
+    farther."""
     labels, geometry = environment.labels, environment.geometry
     run = 0.0
     s = begin

@@ -412,7 +412,7 @@ class ConcentricTubes:
         return self._shared_curvature()
 
     def _shared_curvature(self, *around: Tube) -> float:
-        """Return the bent inner tube's curvature in others, 1/mm, shared by bending stiffness [Rucker2010]."""
+        """Return a bent inner tube's curvature in others, 1/mm, by bending stiffness [Rucker2010]."""
         straight = around if self.needle_shaft is None else (self.needle_shaft, *around)
         inner, *others = (float(tube.parts.stiffness_n_mm2[0]) for tube in (self.inner, *straight))
         return self.inner.precurvature_per_mm * (inner / (inner + sum(others)))

@@ -97,7 +97,7 @@ def _look_from(nodes, at, h, pairs, count, work):
 
 @inner_kernel
 def _step(nodes, at, h, pairs, count, work):
-    """Take a step of -h from node `at` to the one before it; `rate` is along s, so that its sign is turned."""
+    """Take a step of -h from node `at` to the one before it; `rate` is along s, so its sign is turned."""
     _s, psi, rate, dpsi, drate = nodes
     _look_from(nodes, at, h, pairs, count, work)
     h2 = h * h

@@ -50,17 +50,11 @@ class PieceLeftOut(Repair):
 
 
 class SpurPruned(Repair):
-    """A twig that was taken off because it barely leaves the branch it grows from; its position is its tip.
-
-    The length is that from the centreline of the parent to the tip.
-    """
+    """A twig taken off as it barely leaves its branch, at its tip; long from the parent's line to it."""
 
 
 class LoopOpened(Repair):
-    """A ring of the lumen (two airways that touch, a hole in a wall) that was cut where it is thinnest.
-
-    Its position is that of the cut, and the length is that once around.
-    """
+    """A ring of the lumen (touching airways, a hole in a wall) cut where thinnest; long once around."""
 
 
 @frozen_record

@@ -36,10 +36,7 @@ def side_by_side(*parts: str) -> str:
 
 
 class Drawing:
-    """Lines and marks in LPS mm, drawn as SVG in one of the views of radiology, `CORONAL` or `AXIAL`.
-
-    The patient's left is right.
-    """
+    """Lines and marks in LPS mm as SVG, `CORONAL` or `AXIAL` as in radiology: the patient's left is right."""
 
     def __init__(self, view: str) -> None:
         self._view = view

@@ -93,10 +93,7 @@ def touched_corners(mask: Mask) -> Mask:
 
 
 def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOLID) -> UInt16:
-    """Return the distance from every voxel corner to the voxels of `mask`, in 1/256 mm rounded down.
-
-    With `CENTRES`, from every voxel centre to the voxel centres of `mask`.
-    """
+    """Return the distance from voxel corners (`CENTRES`: centres) to a mask, in 1/256 mm rounded down."""
     import edt
 
     spacing = tuple(float(s) for s in np.asarray(spacing_mm))

@@ -125,10 +125,7 @@ class MeshDistance:
         self._mesh = _fcl_object(mesh.vertices_lps, mesh.faces) if len(mesh.faces) else None
 
     def segment_distance_mm(self, starts_lps: ArrayLike, ends_lps: ArrayLike) -> Float:
-        """Return the `(N,)` distances in mm from the segments to the surface, 0 where they cross it.
-
-        Their ends, `(N, 3)` LPS mm, may coincide.
-        """
+        """Return `(N,)` distances in mm of segments, ends `(N, 3)` LPS mm, from the surface, 0 if crossed."""
         starts = np.asarray(starts_lps, dtype=np.float64).reshape(-1, 3)
         ends = np.asarray(ends_lps, dtype=np.float64).reshape(-1, 3)
         if self._mesh is None:

@@ -20,10 +20,7 @@ class NoduleSize:
 
 
 def nodule_size(voxels: Int, grid: Grid) -> NoduleSize:
-    """Measure the nodule of some voxels `(N, 3)`; a voxel counts as wide as the mean of its sides.
-
-    Slices are those across the voxel axis that runs nearest to feet-head.
-    """
+    """Measure a nodule's voxels `(N, 3)`, as wide as the mean of their sides, in slices across feet-head."""
     through = int(np.argmax(np.abs(grid.lps_from_ijk[2, :3]) / grid.spacing_mm))
     angles = np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     along = grid.lps(voxels)[:, :2] @ np.stack([np.cos(angles), np.sin(angles)])

@@ -12,10 +12,7 @@ from anatomy.morphology import at_label_borders, pieces_of
 
 
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
-    """Return the lung, 1 or 2, or 0 for none, of every coarse voxel of `tissue`, and its size in voxels.
-
-    None if two lungs could not be told apart.
-    """
+    """Return the lung, 1, 2 or 0 for none, of coarse voxels, and their size; None if not told apart."""
     # The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters.
     step = tuple(max(1, round(2.4 / float(s))) for s in grid.spacing_mm)
     core = ~_pooled(~tissue, step)
@@ -41,10 +38,7 @@ def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
 
 
 def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
-    """Label the two lungs 1 and 2 over `tissue`, told apart by `core`, the voxels that are all tissue.
-
-    The columns of `axes` are the voxel axes in LPS mm.
-    """
+    """Label the lungs 1 and 2 over `tissue`, told apart by `core`; `axes` has voxel axes in LPS mm."""
     import edt
     from skimage.segmentation import watershed
 
@@ -61,10 +55,7 @@ def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
 
 
 def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
-    """Label the two largest parts of `mask` 1 and 2, if they are a lung's size and lie side by side.
-
-    Parts of fewer than `least` voxels are what erosion leaves of one lung.
-    """
+    """Label the two largest parts, of `least` voxels and a lung's size, 1 and 2 if they lie side by side."""
     from scipy import ndimage
 
     parts, sizes = pieces_of(mask)
@@ -85,10 +76,7 @@ def _two_largest(mask: Mask, axes: Float, least: float) -> Int32 | None:
 
 
 def border_of(sides: Int32, step: tuple[int, ...], tissue: Mask) -> Mask:
-    """Return the voxels of `tissue` that have a face neighbour in it on the other side, bool `(ni, nj, nk)`.
-
-    `sides` and `step` are those of `coarse_sides`.
-    """
+    """Return voxels of `tissue` with a face neighbour on the other side, `(ni, nj, nk)`; `coarse_sides`."""
     border = np.zeros(tissue.shape, dtype=bool, order="F")
     meeting = np.argwhere(at_label_borders(sides))
     if not len(meeting):

@@ -1,8 +1,4 @@
-"""Names and bits of the structures in a lung's label volume.
-
-Every voxel of a lung carries one `uint16`: a bit for each structure it belongs to and, for airway
-voxels, the number of its branch.  The bits themselves stand in `anatomy.kernels.labels`.
-"""
+"""Names and bits of the structures in a lung's label volume; `anatomy.kernels.labels` has the bits."""
 
 import numpy as np
 

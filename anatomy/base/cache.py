@@ -22,10 +22,7 @@ def default_cache() -> Path:
 
 
 def user_cache() -> Path:
-    """Return the user's folder for what can be made again; one that cannot be written if there is no home.
-
-    A folder for temporary files would not do: anybody may leave code there, under a name that is known.
-    """
+    """Return the user's folder for what can be made again; no temporary one, where anybody may leave code."""
     base = os.environ.get("XDG_CACHE_HOME") or (os.environ.get("LOCALAPPDATA") if os.name == "nt" else None)
     # By its standard a relative path there is as good as none.
     if base and os.path.isabs(base):

@@ -39,10 +39,7 @@ def array_checksum(array: Array) -> list[Any]:
 
 
 def file_states(folder: Path, names: Iterable[str]) -> dict[str, list[int]]:
-    """Return size, time of change (ns) and CRC-32 of files by name.
-
-    The time is `st_ctime_ns`, which cannot be set back as that of the content can.
-    """
+    """Return size, time of change (`st_ctime_ns`, which cannot be set back) and CRC-32 of files by name."""
     found = {}
     for name in names:
         state = (folder / name).stat()

@@ -15,10 +15,7 @@ from anatomy.base.errors import AnatomyError
 
 
 def end_with_parent() -> None:
-    """Make this process leave Ctrl-C to its parent, end at once on SIGTERM, and end when its parent is gone.
-
-    To be called first, in the main thread.
-    """
+    """Make this process leave Ctrl-C to its parent, and end on SIGTERM or with it; called first of all."""
     forked = multiprocessing.parent_process()
     parent = os.getppid() if forked is None or forked.pid is None else forked.pid
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -53,10 +53,7 @@ class TargetError(LungaccessError):
 
 
 class PlanFileError(LungaccessError):
-    """A stored plan is damaged, of an unknown version or does not belong to this patient.
-
-    The remedy is to plan again if no other is stated.
-    """
+    """A stored plan is damaged, of an unknown version or another patient's; by default: plan again."""
 
     def __init__(
         self,

@@ -34,10 +34,7 @@ def public_names(file: str) -> dict[str, str]:
 
 
 def lazy_exports(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return the `__getattr__` and the `__dir__` of a package whose names are imported when they are used.
-
-    `package` and `file` are its `__name__` and `__file__`.
-    """
+    """Return `__getattr__` and `__dir__` of a package whose names are imported when they are used."""
 
     def get(name: str) -> Any:
         names = public_names(file)

@@ -67,10 +67,7 @@ class _Names(event.Listener):  # type: ignore[misc]
 
 @contextmanager
 def watching_compilations(tell: Callable[[str | None], None]) -> Iterator[None]:
-    """Call `tell` within the block with the name of each kernel that has to be compiled, and None after it.
-
-    A kernel that is loaded from disk is not reported.
-    """
+    """Call `tell` in the block with the name of each kernel that is compiled, not loaded; None after it."""
     listener = _Names(tell)
     event.register("numba:compile", listener)
     try:

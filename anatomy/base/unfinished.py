@@ -89,10 +89,7 @@ def locked(folder: Path, name: str = LOCK) -> Iterator[bool]:
 
 
 def is_abandoned(path: Path) -> bool:
-    """Tell whether nobody fills or empties a file or folder any longer.
-
-    Of a folder the lock tells.  Files are abandoned after a day, as are folders where there are no locks.
-    """
+    """Tell whether nobody fills or empties a path any longer: by its lock, without one after a day."""
     # No anatomy takes so long to prepare: what is older and bears no lock was left behind.
     aged = time.time() - path.stat().st_mtime > SECONDS_PER_DAY
     if not path.is_dir():

@@ -1,7 +1,4 @@
-"""Centreline files: .vtp and .vtu with a radius at every point, as an `AirwayTree` and back.
-
-Arrays of VTK XML may be ascii, base64 or raw, plain or compressed by zlib.
-"""
+"""Centreline files, .vtp and .vtu with a radius at every point, as an `AirwayTree` and back."""
 
 from __future__ import annotations
 

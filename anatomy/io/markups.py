@@ -33,10 +33,7 @@ _LARGEST_BYTES = 1 << 28
 
 @frozen_record
 class ControlPoint:
-    """A point of a markup, and the frame `(4, 4)` LPS mm that 3D Slicer keeps at it.
-
-    It is oriented if that frame was stated: 3D Slicer gives every point that of its screen, RAS.
-    """
+    """A point of a markup and its frame `(4, 4)` LPS mm; oriented if that is not 3D Slicer's default."""
 
     label: str
     lps_from_point: Float

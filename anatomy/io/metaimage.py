@@ -1,7 +1,4 @@
-"""MetaImage files (.mha, .mhd): the text header, and the stream of voxels.
-
-The header is read here for the reasons that `anatomy.io.nrrd` gives.
-"""
+"""MetaImage files (.mha, .mhd): the text header, read here as in `anatomy.io.nrrd`, and the voxels."""
 
 import re
 from collections.abc import Iterator, Mapping

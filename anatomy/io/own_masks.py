@@ -78,10 +78,7 @@ class PatientFile:
 
 
 def description_text(keys: Mapping[str, Any]) -> str:
-    """Return a `patient.toml` with those keys of `PatientFile` that are not empty.
-
-    Numbers have three decimals, and two in a list.
-    """
+    """Return a `patient.toml` with the keys that are not empty; three decimals, two in a list."""
     return "".join(f"{key} = {_toml(value)}\n" for key, value in keys.items() if value)
 
 

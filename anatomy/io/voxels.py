@@ -78,10 +78,7 @@ def read_array(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Arra
 
 
 def read_two_valued(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Volume | None:
-    """Read voxels of 0 and of one whole number above it as a bool mask; None if there are other values.
-
-    Errors as `read_array`.
-    """
+    """Read voxels of 0 and one whole number above it as a mask, else None; errors as `read_array`."""
     mask = np.zeros(header.grid.shape, dtype=np.bool_, order="F")
     flat = mask.reshape(-1, order="F")
     mark = 0.0
@@ -104,10 +101,7 @@ def require_numbers(values: Array, path: str | Path) -> None:
 
 
 def _chunks(header: ImageHeader, stream: Iterator[bytes], path: Path) -> Iterator[tuple[int, Array]]:
-    """Yield (index of the first voxel, values) until the image is full, then drain the stream.
-
-    Draining proves the checksum, which stands at the end of a compressed file.
-    """
+    """Yield (first voxel, values) until the image is full; drain the stream, for its checksum."""
     n_values, size, at, tail = header.n_values, header.dtype.itemsize, 0, b""
     for piece in stream:
         data = tail + piece if tail else piece

@@ -43,10 +43,7 @@ def any_normal(tx, ty, tz):
 
 @kernel()
 def arc_to_point(pose, q):
-    """Return length, bend and turn (rad) of the arc that starts at `pose` and ends at the point `q`.
-
-    It is the unique circle through `q` tangent to the pose; a point straight behind is infinitely far.
-    """
+    """Return length, bend and turn (rad) of the one arc from `pose` to a point; infinite straight behind."""
     px, py, pz, tx, ty, tz = pose
     dx = q[0] - px
     dy = q[1] - py

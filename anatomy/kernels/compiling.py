@@ -32,11 +32,7 @@ _choose_processor()
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function when it is first called, or finds its machine code on disk.
-
-    Args:
-        **options: Options of `numba.njit`, such as ``nogil=True``.
-    """
+    """Return a decorator, by options of `numba.njit`, that compiles at a first call, or finds the code."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)

@@ -1,8 +1,4 @@
-"""Bits of a voxel's label: the one place where they are defined, for kernels and everybody else.
-
-A label is a `uint16`: a bit for each structure the voxel belongs to and, above them, the number of the
-airway branch.
-"""
+"""Bits of a voxel's uint16 label, one a structure; above them is the number of the airway branch."""
 
 AIRWAY = 1
 """Airway lumen or wall."""

@@ -72,10 +72,7 @@ def gradient_at(nodes, frame, x, y, z, out):
 
 @kernel()
 def pulled_back(nodes, frame, share, qx, qy, qz, x, y, z):
-    """Return the place of the masks that is at `q` in a phase, and how far from `q` it is then, mm.
-
-    The search begins at `x, y, z`.
-    """
+    """Return the place of the masks that is at `q` in a phase, sought from `x, y, z`, and its error, mm."""
     rest = math.inf
     for _ in range(MOST_STEPS):
         dx, dy, dz = displacement_at(nodes, frame, x, y, z)

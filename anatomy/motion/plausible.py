@@ -19,10 +19,7 @@ GREATEST_MM = 60.0
 
 
 def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
-    """Return a motion with its figures and warnings, or raise AnatomyError if it cannot be that of lungs.
-
-    `lungs` holds places `(N, 3)` LPS mm of the right and the left lung.
-    """
+    """Return a motion with figures and warnings; AnatomyError if `(N, 3)` LPS mm of lungs cannot move so."""
     least = _require_invertible(motion)
     moved = {side: motion.amplitude * motion.displacements_mm(lungs[side], side) for side in lungs}
     far = {side: float(np.percentile(np.linalg.norm(each, axis=1), 95)) for side, each in moved.items()}
@@ -81,10 +78,7 @@ def _basal_mm(places: Float, moved: Float) -> float:
 
 
 def _require_invertible(motion: Motion) -> float:
-    """Return a bound of how little of a length is left anywhere in any phase; it must be above 0.
-
-    Then `x_phi` is strictly monotone on the convex box of the nodes, and no two places meet.
-    """
+    """Return a bound, above 0, of how little of a length is left in any phase: then no two places meet."""
     least = np.stack([motion.least_stretch(side) for side in (RIGHT, LEFT)])
     worst = np.unravel_index(int(least.argmin()), least.shape)
     value = float(least[worst])

@@ -42,10 +42,7 @@ def smooth_line(knots: Float, step_mm: float) -> Float:
 
 @dataclass
 class Sprouts:
-    """A tree while it grows; one list entry a branch, parents before children.
-
-    The first point of a branch is the last point of its parent.
-    """
+    """A tree while it grows; one entry a branch, parents first, each from the last point of its parent."""
 
     parent: list[int] = field(default_factory=list)
     points: list[Float] = field(default_factory=list)

@@ -229,10 +229,7 @@ LEAST_HU, GREATEST_HU = -1024, 3071
 
 
 def simulate_ct(canvas: Canvas, noise_hu: float, rng: np.random.Generator) -> Volume:
-    """Return the int16 CT in HU: material shares, Gaussian point spread of 0.6 mm, white noise.
-
-    The patient lies on the back, so the lung is denser towards +y.
-    """
+    """Return the int16 CT in HU: shares, 0.6 mm point spread, noise; on the back, lung is denser at +y."""
     from scipy.ndimage import gaussian_filter
 
     image = _materials(canvas)

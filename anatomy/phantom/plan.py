@@ -92,10 +92,8 @@ CENTRAL = (
 def _skeleton(
     scale: float, rng: np.random.Generator, central_length: float
 ) -> dict[str, tuple[Float, Float]]:
-    """Return start and end `(3,)` LPS mm of every bronchus of the template, slightly varied.
-
-    `central_length` is a factor of the lengths of main and lobar bronchi.
-    """
+    """Return start and end `(3,)` LPS mm of the template's bronchi, varied; main and lobar ones scaled in
+    length."""
     top = scale * TRACHEA_LENGTH_MM * np.array([rng.uniform(-0.02, 0.02), -0.12, 1.0])
     ends = {"trachea": (top, np.zeros(3))}
     for bronchus in TEMPLATE:

@@ -118,10 +118,7 @@ def _around(chest: Chest, side: Side, x: Array, y: Array, z: Array) -> UInt8:
 
 
 def _draw_fissures(canvas: Canvas, scale: float, open_share: float) -> None:
-    """Label one layer of voxels between neighbouring lobes, open at the hilum as in most people.
-
-    The share nearest to the hilum of each lung is left out: there fissures are incomplete most often.
-    """
+    """Label one layer of voxels between lobes, open at the hilum by a share, as fissures mostly are."""
     lobes = canvas.lobes
     found = np.zeros(lobes.shape, dtype=bool, order="F")
     for axis in range(3):
@@ -144,10 +141,7 @@ def _draw_fissures(canvas: Canvas, scale: float, open_share: float) -> None:
 
 
 def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
-    """Draw a tree of kind "airway", "artery" or "vein"; `base` is the number of branches drawn before.
-
-    Returned is which branches `(B,)` fitted and were drawn.
-    """
+    """Draw an "airway", "artery" or "vein" tree after `base` branches; return which `(B,)` were drawn."""
     sprouts = tree.sprouts
     allowed = np.zeros(len(LABELS), dtype=np.bool_)
     allowed[[LABELS[name] for name in ("lung", "fissure", "lumen", "wall", "artery", "vein")]] = True

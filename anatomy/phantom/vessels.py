@@ -58,11 +58,8 @@ class Obstacles:
 
 
 def _plane_normal(airways: Sprouts, branch: int, below: list[int], reference: Float) -> Float:
-    """Return the unit vector from airway to artery at the end of a branch, as near `reference` as possible.
-
-    It is perpendicular to the plane of the children `below`, so that the copied branching cannot cross
-    the airway.
-    """
+    """Return the unit vector from airway to artery at a branch's end, nearest `reference`, across the
+    children's plane."""
     if len(below) >= 2:
         normal = np.cross(airways.direction(below[0]), airways.direction(below[1]))
     else:
@@ -131,10 +128,7 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
 def grow_veins(
     territory: Territory, obstacles: Obstacles, rule: GrowthRule, scale: float, rng: np.random.Generator
 ) -> Sprouts:
-    """Grow five lobar veins into the half of each lobe's points that is farthest from `obstacles`.
-
-    Branch 0 is a stub in the left atrium; blood flows from child to parent.
-    """
+    """Grow five lobar veins, from a stub in the left atrium, into the points farthest from `obstacles`."""
     from scipy.spatial import cKDTree
 
     veins = Sprouts()

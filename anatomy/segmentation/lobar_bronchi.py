@@ -115,10 +115,7 @@ def _parted(regions: Regions, cuts: tuple[int, ...]) -> Int:
 
 
 def _named(regions: Regions, part: Int, lobes: tuple[int, ...]) -> Int:
-    """Return the lobe of each branch by its part; part 0 has none, and nor has any if a part is empty.
-
-    The upper lobe reaches highest; of the two others of the right lung the middle lobe lies in front.
-    """
+    """Return each branch's lobe by its part: the upper is highest, the middle in front; 0 for none."""
     numbers = np.zeros(len(lobes) + 1, dtype=np.int64)
     parts = [part == number for number in range(1, len(lobes) + 1)]
     if all(regions.volume[each].sum() > 0 for each in parts):

@@ -154,12 +154,8 @@ def _bands(lobes: UInt8, near: Mask, seen: Mapping[str, float]) -> UInt8:
     """Return around each border of lobes the chance in percent that a place lies beyond the true fissure.
 
     How far the fissure may lie from the border grows with the way along the border to where it is seen.  The
-    error of its place is taken for normal, and as one for all places that are as near to each other.
-
-    Args:
-        lobes ((nk, nj, ni) uint8): On cubic voxels.
-        near ((nk, nj, ni) bool): Where a sheet is near.
-        seen: Share of each border at which a fissure is seen.
+    error of its place is taken for normal, and as one for all places that are as near to each other.  Lobes
+    and `near`, where a sheet is near, are on cubic voxels (nk, nj, ni).
     """
     from scipy import ndimage, special
 
@@ -184,10 +180,7 @@ def _bands(lobes: UInt8, near: Mask, seen: Mapping[str, float]) -> UInt8:
 
 
 def confirmed_lobes(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask, lobes: UInt8) -> Lobes:
-    """Return lobes from elsewhere with the fissures between them, and how much of these the CT shows.
-
-    The parameters are those of `segment_lobes`, and lobes `(ni, nj, nk)` by our own numbers.
-    """
+    """Return given lobes `(ni, nj, nk)` with fissures, and how much the CT shows, as `segment_lobes`."""
     cubic, sheets = _sheets(ct, lungs, airways, vessels)
     return _with_fissures(lobes, cubic.sampled(lobes), lungs, sheets, cubic, [])
 

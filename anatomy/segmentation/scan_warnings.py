@@ -115,10 +115,7 @@ def tree_or_error(lumen: Volume) -> AirwayTree | AnatomyError:
 
 
 def airway_warnings(tree: AirwayTree | AnatomyError, left: Mask, right: Mask, grid: Grid) -> tuple[str, ...]:
-    """Judge a lumen by its tree: trachea cut, airway that stops early, leak.
-
-    Lungs are bool `(ni, nj, nk)` on the grid.
-    """
+    """Judge a lumen by its tree: trachea cut, early stop, leak; lungs are bool `(ni, nj, nk)` on the grid."""
     if isinstance(tree, AnatomyError):
         return (f"No tree can be made from the airway: {tree.found}.",)
     warnings = []
@@ -171,10 +168,7 @@ def cut_off(central_airway: Mask, lumen: Mask, grid: Grid) -> tuple[str, ...]:
 
 @frozen_record
 class Quality:
-    """Figures and warnings about one segmentation; the tree is None if none could be made of the airway.
-
-    The nodules are in the order of their first voxels.
-    """
+    """Figures and warnings about a segmentation; no tree: none could be made; nodules by first voxels."""
 
     volumes_l: dict[str, float]
     tree: AirwayTree | None
@@ -312,10 +306,7 @@ def misplaced(
 
 
 def moved_by(ct: Volume, mask: Mask) -> Float:
-    """Return by how much the mean of the CT in a mask rises, HU, when the mask is moved: `(6,)`.
-
-    The directions are down and up each axis.
-    """
+    """Return by how much the CT's mean in a mask rises, HU, moved down and up each axis: `(6,)`."""
     at = np.flatnonzero(mask.ravel(order="F"))
     voxels = np.stack(np.unravel_index(at[:: max(1, len(at) // SAMPLES)], mask.shape, order="F"), axis=1)
     steps = np.maximum(1, np.rint(STEP_MM / ct.grid.spacing_mm)).astype(np.int64)

@@ -231,10 +231,7 @@ def segment_vessels(
 
 
 def towards_blood(lung_hu: Int16 | Float32, share: float) -> float:
-    """Return what lies a share of the way from the lung's median to blood without contrast medium, in HU.
-
-    With contrast medium the edge of a vessel so lies a little outside the true one: the safe side.
-    """
+    """Return HU a share of the way from lung median to blood without contrast (with it: the safe side)."""
     median = float(np.median(lung_hu))
     return median + share * (BLOOD_HU - median)
 

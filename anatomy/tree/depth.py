@@ -59,10 +59,7 @@ def border_voxels(lumen: Bool) -> Int:
 
 
 def exact_depth_mm(lumen: Bool, spacing_mm: Float, ijk: Float) -> Float:
-    """Return the distance from positions `(N, 3)` in voxel units to the nearest box outside `lumen`.
-
-    0 for positions outside the lumen.  `lumen` must have an empty layer all around.
-    """
+    """Return the distance of `(N, 3)` (voxels) to boxes outside `lumen`, empty at its edges; 0 outside."""
     from scipy.spatial import KDTree
 
     boxes = border_voxels(lumen) * spacing_mm

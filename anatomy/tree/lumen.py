@@ -172,10 +172,7 @@ def require_at_most(count: int, most: int, what: str) -> None:
 
 
 def tunnels(voxels: Int) -> int:
-    """Return how many tunnels run through a set of voxels `(N, 3)` without cavities, connected by corners.
-
-    One minus the Euler number of the union of the voxels as closed boxes.
-    """
+    """Return how many tunnels run through voxels `(N, 3)` without cavities: 1 minus the Euler number."""
     # Of the complex at doubled resolution a cell has as many dimensions as odd coordinates.
     middle = 2 * (voxels - voxels.min(axis=0)) + 1
     sides = middle.max(axis=0) + 2

@@ -234,10 +234,7 @@ MAX_TILT_COS = 0.5
 
 @frozen_record
 class Trunk:
-    """An end of the tree followed inwards over thin side branches to where it divides, or else ends.
-
-    The radius is the median of its nodes, the length goes along them.
-    """
+    """An end of the tree followed inwards over thin side branches to a fork or end, its radius a median."""
 
     nodes: list[int]
     radius_mm: float
@@ -298,10 +295,7 @@ def follow_trunk(tree: SkeletonTree, end: int) -> Trunk:
 
 
 def _is_bulge(tree: SkeletonTree, nodes: list[int]) -> bool:
-    """Tell whether a branch is a dead end so near to where it begins that it is a bulge of the wall.
-
-    A trachea has one at its edges where its back wall is pressed in, as after breathing out.
-    """
+    """Tell whether a branch is a dead end so near its begin that it is a bulge, as of a pressed wall."""
     offset = float(np.linalg.norm(tree.mm[nodes[-1]] - tree.mm[nodes[0]]))
     return len(tree.neighbours[nodes[-1]]) == 1 and offset < BEYOND_RADII * tree.depth_mm[nodes[0]]
 

@@ -70,10 +70,7 @@ def _between(begin: Int, end: Int, prepared: PreparedLumen) -> list[Int]:
 
 
 def centred(voxel_tree: VoxelTree, prepared: PreparedLumen, rounds: int) -> VoxelTree:
-    """Move the positions to the middle of the lumen and smooth them, every step staying inside.
-
-    Root, tips and both sides of a gap stay where they are.
-    """
+    """Move all positions but root, tips and gaps to the middle of the lumen, and smooth them, inside it."""
     fixed = voxel_tree.across_gap.copy()
     fixed[voxel_tree.parent[voxel_tree.across_gap]] = True
     fixed[0] = True

@@ -41,11 +41,8 @@ def _pop(heap):
 def flood(labels, cost):
     """Give every voxel of 0 the label from which the way to it costs least, in place.
 
-    A step between two voxels that share a face costs the mean of theirs.
-
-    Args:
-        labels ((nk, nj, ni) int32): Above 0 at seeds, 0 where a label is wanted, below 0 where no way leads.
-        cost: (nk, nj, ni) float32.
+    A step between two voxels that share a face costs the mean of theirs.  `labels` (nk, nj, ni) int32 are
+    above 0 at seeds, 0 where a label is wanted, below 0 where no way leads; `cost` is (nk, nj, ni) float32.
     """
     nk, nj, ni = labels.shape
     label, price = labels.ravel(), cost.ravel()

@@ -19,10 +19,7 @@ AIR_HU = -1000.0
 
 @merged_kernel
 def closing_at(hu, state, at, row):
-    """Close the image with its lumen painted, with a pixel and its four neighbours, at one voxel.
-
-    `row` is the flat step from one row of a slice to the next.
-    """
+    """Close the image with lumen painted by a pixel and its four neighbours at a voxel; `row` steps a row."""
     least = np.int16(32767)
     for m in range(5):
         middle = at + cross(m, row)

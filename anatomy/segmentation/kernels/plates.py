@@ -68,13 +68,9 @@ def grow_sheets(response, normal, least, cosine, sheet, stack):
     """Number the sheets from 1 on and return their sizes in voxels, that of number 0 being 0.
 
     Neighbours (26) of at least `least` belong together if the cosine between their normals is large.
-
-    Args:
-        response: (nk, nj, ni) float32.
-        normal: (3, nk, nj, ni) float32.
-        least, cosine: float64.
-        sheet ((nk, nj, ni) int32): Zeros; filled with the number of each voxel's sheet.
-        stack ((n,) int64): Room for every voxel of at least `least`.
+    `response` is (nk, nj, ni) and `normal` (3, nk, nj, ni) float32; `sheet` (nk, nj, ni) int32 begins with
+    zeros and gets the number of each voxel's sheet; `stack` (n,) int64 has room for every voxel of at least
+    `least`.
     """
     nk, nj, ni = response.shape
     sizes = [0]

@@ -40,10 +40,7 @@ def _along_row(padded, weights, out):
 
 @kernel(nogil=True)
 def smooth_in_planes(image, first, last, row_weights, column_weights):
-    """Smooth the planes `first <= k < last` of `image` `(nk, nj, ni)` float32 along i, then along j.
-
-    The weights are float32, that of the centre first.
-    """
+    """Smooth `first <= k < last` of `(nk, nj, ni)` float32 along i, then j, by weights, centre first."""
     nj, ni = image.shape[1], image.shape[2]
     radius = row_weights.shape[0] - 1
     padded = np.zeros(ni + 2 * radius, dtype=np.float32)

@@ -78,7 +78,7 @@ def _weights(f, row):
 
 @inner_kernel
 def depth_at(lumen, x, y, z, work):
-    """Return the signed depth at a point, mm, least off the grid; `work` (28,) begins with its gradient."""
+    """Return a point's signed depth, mm, deep in the wall off the grid; `work` (28,) gets its gradient."""
     g, field = lumen.geometry, lumen.depth
     u = g[0, 0] * x + g[0, 1] * y + g[0, 2] * z + g[0, 3]
     v = g[1, 0] * x + g[1, 1] * y + g[1, 2] * z + g[1, 3]

@@ -56,7 +56,7 @@ ORDER_SEED = 1
 
 
 class ReachScan:
-    """Many start poses in one needle environment, to be asked about any number of points.
+    """Many start poses in one needle environment, to be asked about any number of points, by several threads.
 
     It may be used by several threads at once.  Raises SettingsError if `arcs` is below 1 or `trees` below 0.
 

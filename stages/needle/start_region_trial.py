@@ -43,11 +43,9 @@ def try_starts(
 ) -> TriedStarts:
     """Try start poses around a planned one; the same input and seed give the same answer.
 
-    Args:
-        path: The planned path; paths of several arcs are looked for through points on it and beside it.
-        offset_mm, tilt_rad: How far the poses may be from the planned start.
-        poses: About how many; they are `DIRECTIONS` at each place.
-        iterations: Of the RRT from each pose from which nothing simpler leads to the target; 0 for none.
+    Paths of several arcs are looked for through points on the planned path and beside it.  About `poses` are
+    tried, `DIRECTIONS` at each place; the RRT from each pose from which nothing simpler leads to the target
+    has `iterations`, 0 for none.
 
     Raises:
         SettingsError: If a number is out of its range.

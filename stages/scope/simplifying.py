@@ -83,7 +83,7 @@ def legs_of(motion: ScopeMotion) -> Legs:
 
 
 class Simplifier:
-    """Looks for motions of fewer changes and twists to the end of a proved one.
+    """Looks for motions of fewer changes and twists to the end of a proved one, with room of `least_mm`.
 
     The device is the scope, and the largest curvature that what passes its channel can stand.
     `end_bends_rad` are the bends farthest down and up of the section at the tip, and `least_mm` is the room

@@ -51,15 +51,14 @@ there, and it comes there within hundreds of iterations, to 1 mm within many tho
 class NeedleProblem:
     """Plans needle paths among obstacles with OMPL; made once, asked many times.
 
+    `setup` holds the question of `pose`, for OMPL's own tools, and `planner` is installed in it: the default
+    search, which may also be `anytime`.
+
     Args:
         searches (mapping of names to callables): Each makes a search of an environment, a query and a seed.
             The first is the default; without any, all of `stages.needle.search.planners`.
         objective: What those make small, the patient's cost map included; the planners of OMPL look at no
             objective, but enter no voxel of infinite cost.
-
-    Attributes:
-        setup: The question of `pose`, for OMPL's own tools.
-        planner: The planner installed in `setup`: the default search, which may also be `anytime`.
     """
 
     def __init__(

@@ -208,9 +208,10 @@ def _arrived(query: Query, miss_mm: float) -> Replan:
 class Replanner:
     """Holds the plan that is being followed, and makes a new one from any pose the needle is in.
 
-    A replan is made from, in this order: what is left of the plan, steered exactly through its own
-    points; the single arc; ways back to the plan; the shortest path in free space; the RRT, with a given
-    number of iterations, for what is cheaper.  Nothing depends on a clock.
+    A replan is made from, in this order: what is left of the plan, steered exactly through its own points;
+    the single arc; ways back to the plan; the shortest path in free space; the RRT, with a given number of
+    iterations, for what is cheaper.  Nothing depends on a clock: the same seed and the same sequence of calls
+    give the same replans.
 
     Limits count from the needle's first start: length and turn behind the tip, the exemption at the exit,
     and the angle, which is measured from the first direction.  Raises SettingsError if `iterations` is
@@ -262,11 +263,9 @@ class Replanner:
     ) -> Replan:
         """Plan from the pose that the tip is in; a path that is found becomes the plan.
 
-        Args:
-            lps_from_tip ((4, 4) float64): +z is the direction of insertion.
-            target: (3,) float64, LPS mm.
-            inserted_mm: Length of needle from its first start to the tip.
-            turned_rad: Turn accumulated on this length; by default what the plans so far say.
+        The pose `(4, 4)` looks along +z, the direction of insertion; the target is `(3,)`, LPS mm.  The
+        length of needle counts from its first start, and so does the turn, by default what the plans so far
+        say.
 
         Raises:
             FrameError: If pose or target are not finite numbers or the pose is not rigid.

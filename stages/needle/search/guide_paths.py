@@ -171,7 +171,7 @@ class StateLatticeSearch:
         self._table = np.zeros(2 * MOST_STATES, dtype=np.int32)
 
     def everywhere(self, layers: int, *, skew: int = 0) -> GuidePath:
-        """Return the cheapest guide path anywhere.
+        """Return the cheapest guide path anywhere; `skew`, less than SKEWS, turns the lattice.
 
         More `layers` are finer, and take time by about the 7th power; `skew`, less than SKEWS, turns the
         lattice.
@@ -181,7 +181,7 @@ class StateLatticeSearch:
         return self._explore(base, axes, goal_cells, 1 << 14, math.inf)
 
     def around(self, controls: Float, cells: float, turn_rad: float, bound: float = math.inf) -> GuidePath:
-        """Return the cheapest guide path near another one, if it costs less than `bound`.
+        """Return the cheapest guide path near the controls of another one, if it costs less than `bound`.
 
         `controls` `(L + 2, 3)` LPS mm are as those of `GuidePath`; `cells` is the size of a cell as a share
         of what the greatest curvature allows, and `turn_rad` turns the lattice about the line to the target.

@@ -218,15 +218,9 @@ def successive_halving(
     """Yield the candidates of each rung, and how much work each of them is to get on it.
 
     The caller does the work before it asks for the next rung.  The cheapest candidates go on to that, the
-    cheapest first, for twice the work each.
-
-    Args:
-        candidates: Those of the first rung.
-        cost: Returns what a candidate costs after the work so far; infinite ones go no further.
-        work: Work for each candidate on the first rung, in a unit of the caller's.
-        survivors: Returns how many candidates go on, given how many a rung had and how many of them have a
-            finite cost.
-        rungs: Number of rungs; by default the last rung is the first that has no more than one candidate.
+    cheapest first, for twice the work each; those of infinite cost go no further.  `survivors` returns how
+    many go on, given how many a rung had and how many of them have a finite cost.  By default the last rung
+    is the first that has no more than one candidate.
     """
     for rung in count() if rungs is None else range(rungs):
         yield candidates, work << rung

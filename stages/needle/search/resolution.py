@@ -130,14 +130,11 @@ class Cells:
 
 @frozen_value
 class Counts:
-    """What a search has done.
+    """What a search has done: entries taken off the queue, and poses reached by words that are proved clear.
 
-    Args:
-        pops: Entries taken off the queue.
-        nodes: Poses reached by words that are proved clear.
-        duplicates: Words dropped because another one ends there at no greater cost.
-        pruned: Words dropped because no path within the limits leads on to the goal for less than the best.
-        refused: Words dropped because their last piece is not proved clear.
+    Words are dropped as duplicates because another one ends there at no greater cost, as pruned because no
+    path within the limits leads on to the goal for less than the best, and as refused because their last
+    piece is not proved clear.
     """
 
     pops: int

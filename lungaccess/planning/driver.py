@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,10 +19,6 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request, StatedPlace
 from stages.tube import exit_points
-
-if TYPE_CHECKING:
-    from lungaccess.planning.searches import CostFinder
-    from lungaccess.planning.success.finder import ContestFinder
 
 TIP_WITHIN_MM = 1.5
 """How near a scope tip is to a stated one: tips of the atlas are 1 mm apart along the airway."""
@@ -128,6 +124,22 @@ class Turn:
     make: Callable[[float], Plan] | None = None
 
 
+class Finder(Protocol):
+    """What the driver drives: it finds better and better plans of one request."""
+
+    def turns(self) -> Iterator[Turn]:
+        """Search until the caller stops, or all is tried; the same request gives the same turns."""
+
+    def is_met(self, best: Plan, iteration: int) -> bool:
+        """Tell whether the best plan is good enough to stop."""
+
+    def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
+        """Return what comes at the end, after the best plan; None for nothing."""
+
+    def no_plan(self, iteration: int) -> NoPlan:
+        """Return what is raised after so many iterations without a plan."""
+
+
 def atlas_event(share: float) -> ProgressEvent:
     """Return the progress event of an atlas of which a share is made."""
     return ProgressEvent(
@@ -139,13 +151,10 @@ def atlas_event(share: float) -> ProgressEvent:
     )
 
 
-def drive(
-    finder: "CostFinder | ContestFinder", request: Request, tell: Callable[[ProgressEvent], None]
-) -> Iterator[Plan]:
+def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None]) -> Iterator[Plan]:
     """Drive a finder within the limits of a request; yield the plans that keep its constraints.
 
-    The turns of a finder go on until the caller stops or all is tried, and are the same of the same request.
-    The last plan is the best, whose scope comes to its tip by the simplest motion that is found.
+    The last one is the best, whose scope comes to its tip by the simplest motion that is found.
     """
     clock, limits = Clock(), request.limits
     best: Plan | None = None

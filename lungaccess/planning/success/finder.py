@@ -78,7 +78,7 @@ class Contender:
 
 
 class ContestFinder:
-    """Finds plans that are better and better by a rating; see `lungaccess.planning.driver.drive`."""
+    """Finds plans that are better and better by a rating; see `lungaccess.planning.driver.Finder`."""
 
     def __init__(self, request: Request, task: Task, atlas: Atlas, counterfactuals: bool) -> None:
         self._request, self._task, self._atlas = request, task, atlas

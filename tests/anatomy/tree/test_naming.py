@@ -21,6 +21,7 @@ from anatomy.phantom.territory import make_territory
 from anatomy.phantom.traits import Traits
 from anatomy.tree import tree_from_graph
 from anatomy.tree.naming import DIRECTIONS, LEFT, RIGHT, SEGMENT_LOBES, STEMS, name_bronchi
+from tests.anatomy.phantom_lines import edges_of
 
 VARIANTS: tuple[tuple[dict[str, str], tuple[str, ...]], ...] = (
     ({}, ()),
@@ -63,7 +64,7 @@ def varied(seed: int, monkeypatch: pytest.MonkeyPatch) -> tuple[AirwayTree, Cent
     points = drawn.points_lps @ (turned @ (np.eye(3) + rng.normal(0.0, 0.05, (3, 3)))).T
     waves = np.sin(drawn.points_lps @ rng.normal(0.0, 1.0 / 60.0, (3, 3)))
     drawn = replace(drawn, points_lps=points + 3.0 * waves)
-    return tree_from_graph(drawn.points_lps, drawn.radius_mm, drawn.edges), drawn
+    return tree_from_graph(drawn.points_lps, drawn.radius_mm, edges_of(drawn)), drawn
 
 
 def compared(tree: AirwayTree, drawn: Centerlines) -> Counter[str]:
@@ -146,7 +147,7 @@ def test_a_bronchus_of_the_trachea_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     of_point = np.repeat(moved, np.diff(drawn.branch_start))
     onto = points[drawn.branch_start[1] * 3 // 4]
     points[of_point] += onto - points[drawn.branch_start[apical]]
-    tree = tree_from_graph(points, drawn.radius_mm, drawn.edges)
+    tree = tree_from_graph(points, drawn.radius_mm, edges_of(drawn))
     found = compared(tree, replace(drawn, points_lps=points))
     assert found["segment right"] >= 17
     assert found["segment wrong"] == found["lobe wrong"] == 0

@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, islice
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from lungaccess.planning.coupled.kernels.candidate import SCOPE_POSE
 from lungaccess.planning.coupled.kernels.local_search import sample_deployments
 from lungaccess.planning.coupled.search.base import (
     ESTIMATE_SLACK,
+    DirectSearch,
     ParallelSearch,
     SearchSettings,
     Step,
@@ -30,9 +30,6 @@ from lungaccess.plans.candidate import Candidate
 from lungaccess.problem.task import Task
 from stages.needle import Needle, successive_halving
 from stages.tube import many_shapes, shapes_of
-
-if TYPE_CHECKING:
-    from lungaccess.planning.coupled.search.window_search import WindowDirectSearch
 
 
 class LocalSearchRounds:
@@ -100,8 +97,7 @@ class AtlasSearch(ParallelSearch):
         self.evaluator = self.arcs.evaluator
         super().__init__(self.evaluator.blocked)
         self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
-        self.direct: DirectArcSearch | WindowDirectSearch
-        self.direct = DirectArcSearch(self.arcs, self.incumbent, self.settings)
+        self.direct: DirectSearch = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
         self._refined_cost = math.inf
 

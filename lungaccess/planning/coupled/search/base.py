@@ -94,6 +94,19 @@ class AtlasBound(PlanSearch, Protocol):
     arcs: Any
 
 
+class DirectSearch(Protocol):
+    """What looks at the simplest ways from the entries of an atlas before a search goes on from the best.
+
+    Attributes:
+        clear ((C,) int64): After its steps the entries with a clear way, the best first.
+    """
+
+    clear: Int
+
+    def steps(self) -> Iterator[Step]:
+        """Look at all entries, a few in each step; a step has a candidate if it is the best so far."""
+
+
 SearchFactory = Callable[[Task, Atlas], PlanSearch]
 """What makes a search, for instance its class."""
 

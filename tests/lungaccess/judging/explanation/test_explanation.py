@@ -88,7 +88,7 @@ def explain_without(lung: Lung, target: Target, failure: la.NoPlan, atlas: la.At
         raise explain.OutOfTime
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(explain, "scope_changes", lambda *_: iter(()))
+        patched.setattr(explain.coupled, "scope_changes", lambda *_: iter(()))
         return explain_no_plan(lung, SYSTEM, target, failure, atlas=atlas, time_s=None, atlas_of=none)
 
 

@@ -43,7 +43,7 @@ def explanation(small_lung: Lung) -> Explanation:
         raise OutOfTime
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("lungaccess.judging.explanation.explain.scope_changes", none)
+        patched.setattr("lungaccess.planning.coupled.scope_changes", none)
         patched.setattr("lungaccess.judging.explanation.explain.UnreachableProof", none)
         return explain_no_plan(
             small_lung, SYSTEM, target, caught.value, atlas=atlas, time_s=None, atlas_of=none

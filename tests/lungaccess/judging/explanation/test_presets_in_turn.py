@@ -66,7 +66,7 @@ def explained(small_lung: Lung, clock: FakeTime, monkeypatch: pytest.MonkeyPatch
     """Explain a failure: every atlas costs `ATLAS_S`, every other part nothing, and those named reach it."""
     for name in OTHER_PARTS:
         monkeypatch.setattr(explain.Explainer, name, lambda _self: None)
-    monkeypatch.setattr(explain, "direct_candidates", lambda *_: None)
+    monkeypatch.setattr(explain.coupled, "direct_candidates", lambda *_: None)
     monkeypatch.setattr(explain, "run", lambda *_, **__: iter(()))
     accepted: Any = SimpleNamespace(accepted=True)
 

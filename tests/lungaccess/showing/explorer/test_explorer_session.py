@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.explorer_speed import targets
+from tests.lungaccess.planning.coupled.planning import TARGET
 from tests.lungaccess.showing.explorer.session import GROWTH, WINDOW, click_through
 from tests.lungaccess.showing.explorer.windows import Page, Served
 from tests.lungaccess.showing.report import browser
@@ -25,6 +26,8 @@ def test_a_session_keeps_its_memory_and_its_plans(served: Served, patient: Path)
     points = targets(patient, patient.parent / "cache", CLICKS)
     with Page(*WINDOW) as window:
         window.open(served.address.url)
+        # Every process has loaded what it needs once a plan has been made and appraised.
+        window.target(TARGET)
         made = click_through(window, served, points, 5, 2, lambda _made: None)
     assert made.compared >= 2 and made.differing == []
     assert made.messages == []

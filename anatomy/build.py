@@ -38,7 +38,7 @@ SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
 CUT = ("nodules", "nodule_labels", "cost", "lobes", "fissure_band")
 """The images that a lung holds as they were read, cut to its box."""
 AS_READ = ("name", "kind", "starts", "targets_lps", "start_names", "target_names", "sources")
-"""What an organ holds as it was read."""
+"""The values that an organ holds as they were read; none of them depends on the working grid."""
 
 
 def lung_key(sources: Mapping[str, str]) -> str:

@@ -1,4 +1,4 @@
-"""What commands use of the rooms below: each name is imported when it is used, so that help comes at once."""
+"""Commands use these names of the rooms below; each is imported when it is used, so that help is quick."""
 
 from typing import TYPE_CHECKING
 

@@ -114,10 +114,6 @@ class Tool:
         return np.asarray(found - [0.0, 0.0, self.beyond_mm])
 
 
-tool_names = _FILES.names
-"""Returns the names of the tools that ship with the package, sorted."""
-
-
 def load_tool(name_or_path: str | os.PathLike[str]) -> Tool:
     """Read a tool from a preset or from a TOML file.
 

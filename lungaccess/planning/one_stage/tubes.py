@@ -277,7 +277,7 @@ def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] |
 
 
 COSTS = ("lateral_sweep_mm", "follow_the_leader_error_mm", "strain", "arc_error_mm")
-"""What is told of every shape of a design beside its tip, in this order."""
+"""The values that are told of every shape of a design beside its tip, in this order."""
 
 
 def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:

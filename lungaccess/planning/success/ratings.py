@@ -162,7 +162,7 @@ class FunctionRating:
 
 
 Rating = ChanceRating | FunctionRating
-"""What says how good plans are."""
+"""A rating says how good plans are: the contest asks both kinds the same."""
 
 
 def rating_of(request: Request) -> Rating | None:

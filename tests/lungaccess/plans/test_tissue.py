@@ -18,10 +18,11 @@ from lungaccess.judging.checking import check
 from lungaccess.planning.procedure import simulate_procedure
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.tissue import wanted_of
+from lungaccess.problem import tools
 from lungaccess.problem.error_files import load_errors
 from lungaccess.problem.procedures import load_procedure
 from lungaccess.problem.system import System, system_fingerprint, systems_with_tool, with_tool
-from lungaccess.problem.tools import Tool, load_tool, tool_names
+from lungaccess.problem.tools import Tool, load_tool
 from lungaccess.uncertainty.risk.assessor import RiskAssessor
 from lungaccess.uncertainty.risk.deviations import Deviations, deviated_pieces, deviated_starts
 from lungaccess.uncertainty.risk.statistics import share_of
@@ -174,8 +175,9 @@ def test_risk_with_another_tool_says_what_counts(
 
 
 def test_presets_are_tools_whose_points_fill_them() -> None:
-    assert tool_names() == ("ablation", "aspiration", "brush", "core", "cryoprobe", "forceps")
-    for name in tool_names():
+    names = sorted(file.stem for file in (Path(tools.__file__).parent / "presets" / "tools").glob("*.toml"))
+    assert names == ["ablation", "aspiration", "brush", "core", "cryoprobe", "forceps"]
+    for name in names:
         tool, system = load_tool(name), with_tool(SYSTEM, load_tool(name))
         points = tool.points()
         assert points[:, 2].min() >= tool.from_tip_mm and points[:, 2].max() <= tool.to_tip_mm

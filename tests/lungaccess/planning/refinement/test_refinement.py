@@ -16,6 +16,7 @@ from anatomy.grid import Volume
 from anatomy.lung import Lung
 from anatomy.structures import OBSTACLES
 from lungaccess.planning.refinement import boxes, refine
+from lungaccess.planning.refinement.geometry import Geometry
 from lungaccess.planning.refinement.joint import Reconstruction
 from lungaccess.planning.refinement.problem import (
     LocalAxis,
@@ -26,7 +27,7 @@ from lungaccess.planning.refinement.problem import (
     rows_of,
     split,
 )
-from lungaccess.planning.refinement.program import Geometry, Program, program
+from lungaccess.planning.refinement.program import Program, program
 from lungaccess.plans.assemble import assemble
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator

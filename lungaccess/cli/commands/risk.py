@@ -76,6 +76,12 @@ def risk(
         )
     output.tell(record(report, kept) | resting_record(rested))
     terminal.say(lazy.Headline.of(None, report).chance_text)
+    planned = stored.chance
+    if planned is not None and planned.procedure != followed.name:
+        terminal.say(
+            f"It was planned for '{planned.procedure}', with which {of_hundred(planned.share)} of 100 were "
+            f"counted; --procedure {planned.procedure} simulates that anew"
+        )
     terminal.show(
         [_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept), _resting_table(rested)]
     )

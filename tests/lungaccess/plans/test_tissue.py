@@ -142,8 +142,9 @@ def test_the_check_refuses_another_aim_or_tool(plans: dict[str, Plan], small_lun
 
 
 def test_a_plan_for_success_counts_tissue(
-    small_lung: Lung, small_atlas: la.Atlas, plans: dict[str, Plan]
-) -> None:
+    small_lung: Lung, small_atlas: la.Atlas, plans: dict[str, Plan], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     target = la.resolve_target(small_lung)
     system = with_tool(SYSTEM, load_tool("core"))
     asked = {"atlas": small_atlas, "errors": MODEL, "iterations": 1}
@@ -159,6 +160,13 @@ def test_a_plan_for_success_counts_tissue(
     procedure = load_procedure("measured-tip")
     measured = simulate_procedure(best, small_lung, errors=MODEL, procedure=procedure, samples=60)
     assert measured.tissue == best.chance.tissue and measured.succeeds.count > 0
+    # A chance without measuring is not mistaken for the one that the plan states.
+    monkeypatch.setattr("lungaccess.problem.patients.load_patient", lambda *_, **__: small_lung)
+    replace(best, chance=replace(best.chance, procedure="measured-tip")).save(tmp_path / "plan.json")
+    assert main(["risk", str(tmp_path / "plan.json"), "patient", "--samples", "200"]) == ExitCode.OK
+    said = " ".join(capsys.readouterr().out.split())
+    assert "It was planned for 'measured-tip'" in said
+    assert "--procedure measured-tip simulates that anew" in said
 
 
 def test_risk_with_another_tool_says_what_counts(

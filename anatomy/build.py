@@ -252,8 +252,7 @@ def _airway_codes(airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> tu
         )
     voxels = np.argwhere(airway)
     # Centreline points that are looked at to find the branch of an airway voxel.
-    neighbours = min(8, tree.n_points)
-    distance, index = tree.nearest_point_index.query(grid.lps(voxels), k=neighbours)
+    distance, index = tree.nearest_point_index.query(grid.lps(voxels), k=min(8, tree.n_points))
     distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
     branch = tree.branch_of_point[index[np.arange(len(voxels)), nearest]]
@@ -287,8 +286,7 @@ def _field_arrays(
     labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress, reused: Reused
 ) -> Iterator[tuple[str, UInt16]]:
     """Yield the clearance fields one after the other; the unions are minima of the parts."""
-    shape = tuple(n + 1 for n in grid.shape)
-    union: UInt16 = np.full(shape, MAX_STORED, dtype=np.uint16, order="F")
+    union: UInt16 = np.full(tuple(n + 1 for n in grid.shape), MAX_STORED, dtype=np.uint16, order="F")
 
     def corners_of(name: str) -> UInt16:
         tell(f"clearance to {name}")

@@ -82,8 +82,7 @@ class DistanceField:
 
 def touched_corners(mask: Mask) -> Mask:
     """Return the `(ni + 1, nj + 1, nk + 1)` corners that touch a voxel of `mask`."""
-    shape = tuple(n + 1 for n in mask.shape)
-    corners: Mask = np.zeros(shape, dtype=bool, order="F")
+    corners: Mask = np.zeros(tuple(n + 1 for n in mask.shape), dtype=bool, order="F")
     ni, nj, nk = mask.shape
     for di in (0, 1):
         for dj in (0, 1):

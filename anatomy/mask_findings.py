@@ -181,8 +181,7 @@ def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, fl
     voxels, part = components(nodules)
     box = window(*bounds(nodules, 1))
     near = grown_by_one(np.asfortranarray(lung[box]))
-    at = near[tuple((voxels - [axis.start for axis in box]).T)]
-    touches = np.bincount(part, weights=at) > 0
+    touches = np.bincount(part, weights=near[tuple((voxels - [axis.start for axis in box]).T)]) > 0
     yield "nodules_at_lungs", float(touches[part].mean())
     yield (
         "nodules_beyond_lungs_mm",

@@ -66,8 +66,7 @@ def box_surface(mask: Mask, grid: Grid, *, beyond: bool = False) -> SurfaceMesh:
         rest = box_surface(~np.asarray(mask, dtype=bool), grid)
         return replace(rest, faces=rest.faces[:, ::-1])
     padded = np.pad(np.asarray(mask, dtype=bool), 1)
-    quads = [_faces_of(padded, axis, side) for axis in range(3) for side in (0, 1)]
-    corners = np.concatenate(quads)
+    corners = np.concatenate([_faces_of(padded, axis, side) for axis in range(3) for side in (0, 1)])
     shape = np.asarray(mask.shape) + 1
     flat = np.ravel_multi_index(tuple(corners.reshape(-1, 3).T), tuple(shape))
     used, index = np.unique(flat, return_inverse=True)

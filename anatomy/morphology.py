@@ -44,8 +44,7 @@ def bounds(mask: Array, pad: int | Int = 0) -> tuple[Int, Int]:
     They are wider by `pad` voxels, of all axes or of each `(3,)`, as far as the array reaches.
     """
     low, high = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.int64)
-    lines = (mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))
-    for axis, line in enumerate(lines):
+    for axis, line in enumerate((mask.any(axis=(1, 2)), mask.any(axis=(0, 2)), mask.any(axis=(0, 1)))):
         hits = np.flatnonzero(line)
         if hits.size:
             low[axis], high[axis] = hits[0], hits[-1] + 1
@@ -55,8 +54,7 @@ def bounds(mask: Array, pad: int | Int = 0) -> tuple[Int, Int]:
 def voxels_of(mask: Mask) -> Int:
     """Return the indices `(N, 3)` of the voxels of a mask as numpy.argwhere does, fast where they are few."""
     order: Literal["C", "F"] = "F" if mask.flags.f_contiguous else "C"
-    flat = np.flatnonzero(mask.ravel(order=order))
-    ijk = np.stack(np.unravel_index(flat, mask.shape, order=order), axis=1)
+    ijk = np.stack(np.unravel_index(np.flatnonzero(mask.ravel(order=order)), mask.shape, order=order), axis=1)
     return ijk if order == "C" else ijk[np.lexsort(ijk.T[::-1])]
 
 

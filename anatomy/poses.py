@@ -47,8 +47,7 @@ def _unit(vector: Float, name: str) -> Float:
 
 def unit(vector: Float) -> Float:
     """Scale vectors `(..., 3)` to length one (zero stays zero)."""
-    length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.asarray(vector / np.maximum(length, 1e-12))
+    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-12))
 
 
 def spread_directions(count: int) -> Float:

@@ -15,8 +15,7 @@ def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | No
     """Return the lung, 1, 2 or 0 for none, of coarse voxels, and their size; None if not told apart."""
     # The lungs are told apart on voxels of about this side: fast, and finer than any gap that matters.
     step = tuple(max(1, round(2.4 / float(s))) for s in grid.spacing_mm)
-    core = ~_pooled(~tissue, step)
-    sides = grow_sides(core, _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
+    sides = grow_sides(~_pooled(~tissue, step), _pooled(tissue, step), grid.lps_from_ijk[:3, :3] * step)
     return None if sides is None else (sides, step)
 
 
@@ -29,8 +28,7 @@ def points_of_sides(sides: Int32, step: tuple[int, ...], grid: Grid) -> tuple[Fl
 
 def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
     """Unite blocks of `step` voxels: a coarse voxel is True if any voxel in it is."""
-    shape = tuple(-(-n // s) for n, s in zip(mask.shape, step, strict=True))
-    pooled = np.zeros(shape, dtype=bool, order="F")
+    pooled = np.zeros(tuple(-(-n // s) for n, s in zip(mask.shape, step, strict=True)), dtype=bool, order="F")
     for offset in np.ndindex(*step):
         part = mask[tuple(slice(first, None, s) for first, s in zip(offset, step, strict=True))]
         pooled[tuple(slice(0, n) for n in part.shape)] |= part

@@ -35,5 +35,4 @@ def obstacle_bits(with_fissures: bool) -> int:
 def close_border(labels: Labels) -> None:
     """Make the outermost voxels OUTSIDE: distances know nothing of what lies beyond the grid."""
     for axis in range(3):
-        layers = np.moveaxis(labels, axis, 0)
-        layers[[0, -1]] |= OUTSIDE
+        np.moveaxis(labels, axis, 0)[[0, -1]] |= OUTSIDE

@@ -86,8 +86,7 @@ class _Reader:
 
     def piece(self, piece: Element, cells: str) -> VtkPiece:
         count = int(piece.get("NumberOfPoints", "0"))
-        found = self.named(piece.find("Points"))
-        points = next(iter(found.values()), np.zeros((0, 3))).reshape(-1, 3)
+        points = next(iter(self.named(piece.find("Points")).values()), np.zeros((0, 3))).reshape(-1, 3)
         point_data = self.named(piece.find("PointData"))
         for name, array in [("Points", points), *point_data.items()]:
             if len(array) != count:
@@ -133,8 +132,7 @@ class _Reader:
             offset = max(int(element.get("offset", "0")), 0)
             stream, coded = self.appended[offset:], self.encoding == "base64"
         if coded:
-            coded_text = stream.partition(b"<")[0].translate(None, b" \t\r\n")
-            parts = re.findall(rb"[^=]+=*", coded_text)
+            parts = re.findall(rb"[^=]+=*", stream.partition(b"<")[0].translate(None, b" \t\r\n"))
             stream = b"".join(base64.b64decode(part, validate=True) for part in parts)
         size = self.header.itemsize
         count = int(np.frombuffer(_taken(stream, 0, size), self.header)[0])
@@ -297,7 +295,6 @@ def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
         lines.append(nodes if b == 0 else [int(tree.parent_point[nodes[0]]), *nodes])
     ends = np.cumsum([len(line) for line in lines]).tolist()
     space = " ".join(str(c) for c in b"LPS\0")
-    generation = tree.generation[tree.branch_of_point]
     content = "\n".join(
         (
             '<?xml version="1.0"?>',
@@ -309,7 +306,7 @@ def write_centerlines(path: str | Path, tree: AirwayTree) -> None:
             'NumberOfStrips="0" NumberOfPolys="0">',
             '<PointData Scalars="Radius">',
             _data_array("Float64", "Radius", tree.radius_mm.tolist()),
-            _data_array("Int64", "Generation", generation.tolist()),
+            _data_array("Int64", "Generation", tree.generation[tree.branch_of_point].tolist()),
             _data_array("Int64", "Branch", tree.branch_of_point.tolist()),
             "</PointData>",
             "<Points>",

@@ -169,8 +169,7 @@ class _Contours:
             region = np.zeros_like(held)
             for contour in self._drawn[number]:
                 places = self._grid.ijk(contour)
-                level = round(float(places[0, 2]))
-                region[:, :, level] ^= polygon2mask(self._grid.shape[:2], places[:, :2])
+                region[:, :, round(float(places[0, 2]))] ^= polygon2mask(self._grid.shape[:2], places[:, :2])
             held |= region
         return Volume(grid=self._grid, array=held)
 

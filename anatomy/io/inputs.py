@@ -28,8 +28,7 @@ def input_hashes(path: str | Path) -> dict[str, str]:
     require_file(path)
     if path.suffix == ".toml":
         return _hashes(path.parent, {path, *_files_named_in(path)})
-    hashes = _hashes(path.parent, _files_beside(path.parent))
-    return hashes | {f"{path.name} as label map": sha256(path)}
+    return _hashes(path.parent, _files_beside(path.parent)) | {f"{path.name} as label map": sha256(path)}
 
 
 def _hashes(folder: Path, files: set[Path]) -> dict[str, str]:

@@ -110,8 +110,7 @@ def _of_two(values: Array, name: str, low: float, high: float) -> tuple[Mask, tu
     background = low
     if low != 0:
         faces = [np.moveaxis(values, axis, 0)[end] for axis in range(3) for end in (0, -1)]
-        shares = [float(np.mean(face == high)) for face in faces]
-        background = high if float(np.mean(shares)) > 0.5 else low
+        background = high if np.mean([np.mean(face == high) for face in faces]) > 0.5 else low
     mark = high if background == low else low
     said = (
         f"{name} holds {low:g} and {high:g} alone: {mark:g} is taken as the mask, {background:g} as nothing."

@@ -267,8 +267,7 @@ def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
         )
     size = np.array(fixed.GetSize()) * fixed.GetSpacing()
     # Distance of the control points of the spline: a lung has several along each axis.
-    mesh = [max(int(round(n / 40.0)), 2) for n in size]
-    start = SimpleITK.BSplineTransformInitializer(fixed, mesh)
+    start = SimpleITK.BSplineTransformInitializer(fixed, [max(int(round(n / 40.0)), 2) for n in size])
     method = SimpleITK.ImageRegistrationMethod()
     if fixed_is_mask:
         method.SetMetricAsMeanSquares()

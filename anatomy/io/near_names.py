@@ -33,10 +33,9 @@ def require_single(
     its double. `others` are further pairs: an image that is read, and one that stands for the same mask.
     Raises AnatomyError if the two of a pair differ.
     """
-    paths = list(dict.fromkeys(chosen))
     doubles = [
         (path, other)
-        for path in paths
+        for path in dict.fromkeys(chosen)
         for other in images_in(folder)
         if other != path and plain(image_stem(other)) == plain(image_stem(path))
     ]

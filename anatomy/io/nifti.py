@@ -187,8 +187,7 @@ def _lps_from_ijk(
         )
     scale = np.diag([_MM_PER_UNIT[unit]] * 3 + [1.0])
     if sform_code > 0:
-        rows = np.array(fields["srow"], dtype=np.float64).reshape(3, 4)
-        ras = np.vstack([rows, [0, 0, 0, 1]])
+        ras = np.vstack([np.array(fields["srow"], dtype=np.float64).reshape(3, 4), [0, 0, 0, 1]])
         if qform_code > 0:
             _require_agreement(ras, _qform(fields, path), shape, path)
     elif qform_code > 0:

@@ -127,8 +127,7 @@ def _refuse(folder: Path) -> NoReturn:
             expected="one of them",
             remedy=f"Name one, such as {within[0]}",
         )
-    images = [path.name for path in images_in(folder)]
-    there = ", ".join(images[:_SHOWN]) or "no image at all"
+    there = ", ".join([path.name for path in images_in(folder)][:_SHOWN]) or "no image at all"
     raise FileError(
         f"{folder} is no patient of a known kind: it holds {there}",
         expected="a folder of Med-RAD (bronchialTree, vessels, pleuralBoundary), output of TotalSegmentator "

@@ -131,8 +131,7 @@ def load_totalsegmentator(folder: Path, label_map: Path | None = None) -> Patien
     AnatomyError if a structure is missing or empty, or labels cannot be told apart.
     """
     sources, statements = mask_sources(folder, label_map)
-    masks = read_masks(sources)
-    filled = fill_lung(masks)
+    filled = fill_lung(read_masks(sources))
     sidecars = [path for path in folder.glob("*.json") if path.is_file()]
     return assemble(
         filled,

@@ -69,8 +69,7 @@ def compile_ahead(
 
 def code_files() -> tuple[Path, ...]:
     """Return the files of code on disk for the calls that are written down, whatever the command."""
-    found = [file for call in _calls() if (file := _code_file(call)) is not None]
-    return tuple(sorted(set(found)))
+    return tuple(sorted({file for call in _calls() if (file := _code_file(call)) is not None}))
 
 
 def usable_cores() -> int:

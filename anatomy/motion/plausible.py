@@ -154,8 +154,7 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
     ]
     away = [ndimage.distance_transform_edt(~border, sampling=SAMPLE_MM) for border in borders]
     both = np.concatenate([away[1][borders[0]], away[0][borders[1]]])
-    apart = float(both.mean())
-    return {"lungs_dice": dice, "lungs_dice_unmoved": unmoved, "lungs_borders_mm": apart}
+    return {"lungs_dice": dice, "lungs_dice_unmoved": unmoved, "lungs_borders_mm": float(both.mean())}
 
 
 def _dice(a: Mask, b: Mask) -> float:

@@ -93,9 +93,8 @@ def _of_landmarks(
     }
     nodes = np.zeros((2, *at.shape))
     for side, fit in fits.items():
-        inside = _near_lung(labels, grid, nodes_grid, side, middle_x_mm)
         # A fit is evaluated so many nodes beyond its lung, which is slow; farther out it is continued.
-        known = ndimage.binary_dilation(inside, iterations=2)
+        known = ndimage.binary_dilation(_near_lung(labels, grid, nodes_grid, side, middle_x_mm), iterations=2)
         nodes[side][known.ravel()] = fit.at(at[known.ravel()])
         nodes[side] = continued(nodes[side].reshape(*nodes_grid.shape, 3), known).reshape(-1, 3)
     return nodes, figures

@@ -177,8 +177,7 @@ def _wide(canvas: Canvas, tree: PlannedTree, base: int, from_mm: float) -> Mask:
     table = np.zeros(base + len(start) + 2, dtype=np.bool_)
     table[base + 1 : -1] = 2.0 * np.maximum.reduceat(tree.outer_mm, start) >= from_mm
     # The last entry stands for nodules, which belong to no branch.
-    owner = np.where(canvas.owner < 0, len(table) - 1, canvas.owner)
-    return np.asarray(table[owner])
+    return np.asarray(table[np.where(canvas.owner < 0, len(table) - 1, canvas.owner)])
 
 
 def _carrying(labels: UInt8, names: tuple[str, ...]) -> Mask:

@@ -110,8 +110,7 @@ def _skeleton(
 
 def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
     """Assign points `(N, 3)` to segments by angle, weighted for about equal shares; return `(N,)` indices."""
-    rays = unit(cloud[:, None, :] - starts[None])
-    cosine = np.einsum("nsa,sa->ns", rays, directions)
+    cosine = np.einsum("nsa,sa->ns", unit(cloud[:, None, :] - starts[None]), directions)
     weights = np.zeros(len(starts))
     owner = cosine.argmax(axis=1)
     # Shares need only be about equal: each round moves the weights half-way.
@@ -287,8 +286,7 @@ def _vessel_part(
 ) -> tuple[Sprouts, Float]:
     """Return the branches that carry a vessel of `calibre` times their diameter, and its radius `(B,)`."""
     part = sprouts.pruned(calibre * np.array(sprouts.diameter_mm) >= limit_mm)
-    radius_mm = 0.5 * calibre * np.array(part.diameter_mm)
-    return part, np.maximum(radius_mm, GAPLESS_RADIUS * spacing_mm)
+    return part, np.maximum(0.5 * calibre * np.array(part.diameter_mm), GAPLESS_RADIUS * spacing_mm)
 
 
 def _vessels(

@@ -188,8 +188,7 @@ def place_nodules(
     for index in rng.permutation(len(points)):
         centre, lobe = points[index], int(territory.lobe_of_point[index])
         radius = rng.uniform(LEAST_RADIUS_MM, scale * GREATEST_RADIUS_MM)
-        voxel = territory.index(centre)
-        pleura = territory.pleura_depth_mm[voxel]
+        pleura = territory.pleura_depth_mm[territory.index(centre)]
         fits = (
             radius + scale * LEAST_PLEURA_MM + map_error < pleura < scale * GREATEST_PLEURA_MM - map_error
             and territory.holds(centre, lobe, radius + 2 * map_error)

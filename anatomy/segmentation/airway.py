@@ -70,8 +70,7 @@ def segment_airway(ct: Volume, lungs: Lungs, *, progress: Callable[[str], None] 
         )
     tell("airway: map of local minima")
     # The wall reaches less far beyond the lumen.
-    margin = np.ceil(3.0 / ct.grid.spacing_mm).astype(np.int64)
-    box = window(*bounds(inside | lungs.central_airway, margin))
+    box = window(*bounds(inside | lungs.central_airway, np.ceil(3.0 / ct.grid.spacing_mm).astype(np.int64)))
     values = ct.array[box]
     if values.dtype != np.int16:
         values = np.rint(values.astype(np.float32))

@@ -180,8 +180,7 @@ class Box:
 
     def _middles(self, axis: int) -> Float:
         """Return where the middles of the voxels of the box lie along an axis of the CT, in its voxels."""
-        number = np.arange(self.low[axis], self.high[axis])
-        return np.asarray((number + 0.5) * self.ratio[axis] - 0.5)
+        return np.asarray((np.arange(self.low[axis], self.high[axis]) + 0.5) * self.ratio[axis] - 0.5)
 
     def _span(self, margin: int) -> tuple[Int, Int]:
         """Return the voxels of the CT, `start <= ijk < stop`, that the box and a margin cover."""

@@ -25,8 +25,7 @@ def canonical(volume: Volume) -> Volume:
     last = np.zeros(3)
     last[list(order)] = np.where(flipped, np.array(array.shape) - 1, 0)
     matrix[:3, 3] = volume.grid.lps(last)
-    grid = Grid(shape=array.shape, lps_from_ijk=matrix)
-    return _rounded(Volume(grid=grid, array=np.asfortranarray(array)))
+    return _rounded(Volume(grid=Grid(shape=array.shape, lps_from_ijk=matrix), array=np.asfortranarray(array)))
 
 
 def _rounded(volume: Volume) -> Volume:

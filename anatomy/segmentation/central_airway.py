@@ -235,8 +235,7 @@ def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     # Airways narrower than this share of the trachea's radius are left to the segmentation of the airways.
     wide_mm = 0.35 * float(np.percentile(depth[depth > 0], 99))
     core = depth >= wide_mm
-    near = edt.edt(np.asfortranarray(~core), anisotropy=ct.spacing_mm) <= wide_mm
-    wide = part & near
+    wide = part & (edt.edt(np.asfortranarray(~core), anisotropy=ct.spacing_mm) <= wide_mm)
     grid = ct.grid.crop(low, high)
     main = np.zeros(grown.shape, dtype=np.bool_, order="F")
     try:

@@ -55,8 +55,7 @@ class CoarseCt:
         # Transposed, so that the last pass, over the most voxels, copies whole planes.
         values = np.ascontiguousarray(blocks.T)
         for axis in range(3):
-            index = np.arange(low[axis], high[axis]) // self.step[axis]
-            values = np.take(values, index, axis=2 - axis)
+            values = np.take(values, np.arange(low[axis], high[axis]) // self.step[axis], axis=2 - axis)
         return values.T
 
     def box_in_ct(self, mask: Mask, pad_mm: float) -> tuple[Int, Int]:

@@ -96,8 +96,7 @@ def _in_agreement(strength: Float32, normal: Float32) -> Float32:
     total = np.zeros(len(at[0]), dtype=np.float32)
     for a in range(3):
         for b in range(a, 3):
-            blocks = blocks_of(strength * normal[a] * normal[b])
-            summed = blocks.mean(axis=(1, 3, 5), dtype=np.float32)
+            summed = blocks_of(strength * normal[a] * normal[b]).mean(axis=(1, 3, 5), dtype=np.float32)
             # This neighbourhood is wider than a vessel and narrower than folds.
             around = ndimage.gaussian_filter(summed, 3.0 / BLOCK, truncate=2.5)[place]
             along += np.float32(1 if a == b else 2) * normal[a][at] * normal[b][at] * around
@@ -111,8 +110,7 @@ def _in_agreement(strength: Float32, normal: Float32) -> Float32:
 def blocks_of(image: Array) -> Array:
     """Return an image as blocks of 2 x 2 x 2 voxels, along the axes 1, 3 and 5; a rest is cut off."""
     nk, nj, ni = (n // BLOCK for n in image.shape)
-    cut = image[: nk * BLOCK, : nj * BLOCK, : ni * BLOCK]
-    return cut.reshape(nk, BLOCK, nj, BLOCK, ni, BLOCK)
+    return image[: nk * BLOCK, : nj * BLOCK, : ni * BLOCK].reshape(nk, BLOCK, nj, BLOCK, ni, BLOCK)
 
 
 @frozen_record
@@ -157,8 +155,7 @@ class Cubic:
     def index(self, points_lps: Float) -> Int:
         """Return the indices `(N, 3)` along k, j, i of the cubic voxels at points LPS mm, kept in the box."""
         places = (self.grid.ijk(points_lps) + 0.5) * self.grid.spacing_mm / EDGE_MM
-        found = np.floor(places[:, ::-1]).astype(np.int64)
-        return np.clip(found, 0, np.array(self.shape) - 1)
+        return np.clip(np.floor(places[:, ::-1]).astype(np.int64), 0, np.array(self.shape) - 1)
 
 
 def _mean_along(image: Array, axis: int, count: int, spacing_mm: float) -> Float32:

@@ -140,8 +140,7 @@ class SegmentationFolder:
     def write(self, name: str, array: Array, key: str) -> str:
         """Write an image made from `key`, and return the digest of its voxels."""
         digest = digest_of(array)
-        path = self.path_of(name)
-        with atomic_write(path) as temporary:
+        with atomic_write(self.path_of(name)) as temporary:
             write_volume(temporary, Volume(grid=self.grid, array=array), note=NOTES.get(name, ""))
             file = sha256(temporary)
             known = [*self._entry(name).get("written", ())][-1:]
@@ -190,8 +189,7 @@ class SegmentationFolder:
         return dict(self._record.get("images", {}).get(name, {}))
 
     def _refuse_other_ct(self, ct_digest: str) -> None:
-        before = self._record.get("ct")
-        if before in (None, ct_digest):
+        if self._record.get("ct") in (None, ct_digest):
             return
         corrected = [name for name in IMAGES if self.correction(name)]
         corrected += ["what was painted"] if corrections_file(self.path).is_file() else []
@@ -229,8 +227,7 @@ def digest_of(array: Array) -> str:
 
 def grid_digest(grid: Grid) -> str:
     """Return the SHA-256 of a grid."""
-    text = f"{grid.shape}{grid.lps_from_ijk.tobytes().hex()}"
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(f"{grid.shape}{grid.lps_from_ijk.tobytes().hex()}".encode()).hexdigest()
 
 
 def digest_of_ct(ct: Volume) -> str:
@@ -255,8 +252,7 @@ def segmented_ct(folder: Path) -> dict[str, Any] | None:
 
 def key_of(step: str, **parts: Any) -> str:
     """Return the key of a step: the hash of its name, its settings and what it is made from."""
-    text = json.dumps({"step": step, **parts}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return hashlib.sha256(json.dumps({"step": step, **parts}, sort_keys=True).encode()).hexdigest()
 
 
 def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:

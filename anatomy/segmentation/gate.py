@@ -151,8 +151,7 @@ def _on_cubes(points: Float) -> tuple[Mask, Float]:
     low, high = points.min(axis=0) - 2.0 * CUBE_MM, points.max(axis=0) + 2.0 * CUBE_MM
     high[0] = max(high[0], -low[0])
     low[0] = -high[0]
-    shape = np.ceil((high - low) / CUBE_MM).astype(np.int64) + 1
-    chest = np.zeros(shape, dtype=np.bool_)
+    chest = np.zeros(np.ceil((high - low) / CUBE_MM).astype(np.int64) + 1, dtype=np.bool_)
     chest[tuple(np.rint((points - low) / CUBE_MM).astype(np.int64).T)] = True
     return np.asarray(binary_closing(chest, np.ones((3, 3, 3)))), low
 
@@ -168,8 +167,7 @@ def solid_tissue(ct: Volume, lung: Mask) -> tuple[str, ...]:
     core = distance_mm(solid, spacing) >= SOLID_RADIUS_MM
     if not core.any():
         return ()
-    mass = solid & (distance_mm(np.asfortranarray(~core), spacing) <= SOLID_RADIUS_MM)
-    pieces, counts = pieces_of(mass)
+    pieces, counts = pieces_of(solid & (distance_mm(np.asfortranarray(~core), spacing) <= SOLID_RADIUS_MM))
     sizes = counts[1:] * float(np.prod(spacing)) / 1000.0
     found = []
     for piece in np.flatnonzero(sizes >= LEAST_SOLID_ML):

@@ -123,8 +123,7 @@ def _middles(grid: Grid, masks: Iterable[Mask]) -> Float:
 def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
     """Return the left and the right lung of a mask of both; one alone counts as right."""
     coarse = CoarseCt.of(Volume(grid=grid, array=mask.astype(np.int16)))
-    tissue = np.asfortranarray(coarse.hu >= 0.5)
-    sides = sides_from_right(tissue, coarse)
+    sides = sides_from_right(np.asfortranarray(coarse.hu >= 0.5), coarse)
     if sides is None:
         return np.zeros_like(mask), mask
     # Every coarse voxel has the side that is nearest to it.

@@ -100,8 +100,7 @@ def learned_airway(ct: Volume, network: Network) -> Mask:
     scaled = (ct.array.astype(np.float32) - np.float32(how.low_hu)) / np.float32(how.high_hu - how.low_hu)
     image = np.clip(scaled, 0.0, 1.0, out=scaled)
     wanted = np.array(how.spacing_mm) if how.spacing_mm else ct.grid.spacing_mm
-    sampled = _resampled(image, wanted / ct.grid.spacing_mm)
-    share = _tiled(_Runner(network), sampled, how)
+    share = _tiled(_Runner(network), _resampled(image, wanted / ct.grid.spacing_mm), how)
     if share.shape != image.shape:
         share = _resampled(share, ct.grid.spacing_mm / wanted, image.shape)
     found = largest_piece(np.asfortranarray(share >= how.threshold))
@@ -131,8 +130,7 @@ def _resampled(image: Float32, step: Float, shape: tuple[int, ...] | None = None
 def _tiled(run: _Runner, image: Float32, how: NetworkSettings) -> Float32:
     """Return the probabilities of an image: tiles that overlap count less towards their edges."""
     tile = run.tile
-    short = np.maximum(np.array(tile) - image.shape, 0)
-    padded = np.pad(image, [(0, int(n)) for n in short], mode="edge")
+    padded = np.pad(image, [(0, int(n)) for n in np.maximum(np.array(tile) - image.shape, 0)], mode="edge")
     total, weights = np.zeros(padded.shape, dtype=np.float32), np.zeros(padded.shape, dtype=np.float32)
     window = np.ones((1, 1, 1), dtype=np.float32)
     for axis, n in enumerate(tile):

@@ -97,8 +97,7 @@ def _settled(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> Int:
                 value = _value(regions, moved, lobes)
                 if value > best:
                     best, lobe = value, moved
-        part = np.select([lobe == each for each in lobes], range(1, len(lobes) + 1))
-        lobe = _named(regions, part, lobes)
+        lobe = _named(regions, np.select([lobe == each for each in lobes], range(1, len(lobes) + 1)), lobes)
         best = _value(regions, lobe, lobes)
         if best <= before:
             break

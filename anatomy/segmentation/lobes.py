@@ -216,8 +216,7 @@ class _LungParts:
 
     def lobes(self, side: str) -> UInt8:
         """Return the lobes on the cubic voxels; all 0 if there are too few bronchi."""
-        regions = self._regions()
-        lobe_of_branch = lobes_of_branches(regions, OF_LUNG[side])
+        lobe_of_branch = lobes_of_branches(self._regions(), OF_LUNG[side])
         nothing = np.zeros(self._fine.shape, dtype=np.uint8)
         if set(OF_LUNG[side]) - set(lobe_of_branch.tolist()):
             return nothing
@@ -259,8 +258,7 @@ class _LungParts:
         here = np.bincount(tree.branch_of_point, weights=self._inside, minlength=count)
         behind = below @ here
         used = (here > 0) & (behind < TRUNK_SHARE * here.sum())
-        seeds = self._seeded(np.where(used, np.arange(1, count + 1), 0))
-        labels = self._flooded(seeds, self._coarse)
+        labels = self._flooded(self._seeded(np.where(used, np.arange(1, count + 1), 0)), self._coarse)
         used &= np.bincount(labels.ravel(), minlength=count + 1)[1:] > 0
         return _regions_of(labels, self._coarse, below, used, tree.bronchi.lobes, self._cubic, self._low)
 
@@ -301,8 +299,7 @@ class _LungParts:
         nearest = ndimage.distance_transform_edt(coarse == 0, return_distances=False, return_indices=True)
         whole = coarse[tuple(nearest)]
         # In blocks, 10 mm: so far from the border of the diffusion the fissure itself is looked for.
-        band = _grown(at_label_borders(whole), 5)
-        labels = self._on_cubic(np.where(band, 0, whole))
+        labels = self._on_cubic(np.where(_grown(at_label_borders(whole), 5), 0, whole))
         labels[~_grown(self._fine, OUTER_VOXELS)] = -1
         cost = 1.0 + np.float32(FISSURE_COST) * self._likelihood
         flood(labels, cost)
@@ -334,8 +331,7 @@ def _regions_of(
     square = [each.reshape(count + 1, count + 1)[1:, 1:] for each in (sums, faces)]
     at = np.argwhere(labels > 0)
     owner = labels[tuple(at.T)]
-    middle = ((at + 0.5) * BLOCK + low)[:, ::-1] * EDGE_MM / cubic.grid.spacing_mm - 0.5
-    places = cubic.grid.lps(middle)
+    places = cubic.grid.lps(((at + 0.5) * BLOCK + low)[:, ::-1] * EDGE_MM / cubic.grid.spacing_mm - 0.5)
     return Regions(
         volume=np.bincount(owner, minlength=count + 1)[1:].astype(np.float64),
         moment=np.stack([np.bincount(owner, p, minlength=count + 1)[1:] for p in places.T], axis=1),

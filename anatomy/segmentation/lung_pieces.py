@@ -134,8 +134,7 @@ def notches(ct: CoarseCt, right: Mask, left: Mask, closing_mm: float) -> tuple[M
 def _notches_of(ct: CoarseCt, side: Mask, other: Mask, hull: Mask, closing_mm: float) -> Mask:
     """Return the notches of one lung that lie near the hull of both."""
     found = np.zeros(side.shape, dtype=np.bool_, order="F")
-    pad = np.ceil(2.0 * NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)
-    box = window(*bounds(side, pad))
+    box = window(*bounds(side, np.ceil(2.0 * NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)))
     filled = without_holes(closed(np.asfortranarray(side[box]), closing_mm, ct.spacing_mm))
     # Bone is denser on coarse voxels.
     added = closed(filled, NOTCH_MM, ct.spacing_mm) & ~filled & (ct.hu[box] < 150.0) & hull[box]
@@ -178,9 +177,7 @@ def coarse_lung_ex_vivo(
     lung, the airway, the sides (1 right lung, 2 left lung, one lung alone 1), and warnings.  A point in the
     main bronchus or trachea may be given, LPS mm.  Raises AnatomyError if there is no lung or no airway.
     """
-    background = _background(ct)
-    tissue = (ct.hu < GREATEST_LUNG_HU) & ~background
-    lung = largest_piece(np.asfortranarray(tissue))
+    lung = largest_piece(np.asfortranarray((ct.hu < GREATEST_LUNG_HU) & ~_background(ct)))
     if np.count_nonzero(lung) * ct.voxel_ml < SMALLEST_LUNG_ML:
         raise AnatomyError(
             "No inflated lung was found in the air of the image",
@@ -188,8 +185,7 @@ def coarse_lung_ex_vivo(
             remedy="For a CT of a patient leave out --ex-vivo",
         )
     # Airways open to the outside of the lung are closed over this width before its hull is filled.
-    hull = without_holes(closed(lung, 15.0, ct.spacing_mm))
-    airway = _airway(ct, hull, seed_lps)
+    airway = _airway(ct, without_holes(closed(lung, 15.0, ct.spacing_mm)), seed_lps)
     sides = sides_from_right(lung & ~airway.main, ct)
     if sides is not None:
         return GREATEST_LUNG_HU, airway, sides, ()

@@ -113,8 +113,7 @@ def _inside(contour: Mapping[str, Any], grid: Grid, path: Path) -> tuple[int, Ma
             remedy="Give the contours of this CT",
         )
     # Columns and rows count along +x and +y, whichever way the voxels of this image do.
-    against = np.diag(grid.lps_from_ijk)[:2] < 0
-    points = np.where(against, shape - 1 - columns_rows, columns_rows)
+    points = np.where(np.diag(grid.lps_from_ijk)[:2] < 0, shape - 1 - columns_rows, columns_rows)
     filled = polygon2mask(tuple(shape), points) if len(points) > 2 else np.zeros(shape, dtype=np.bool_)
     line = np.zeros(shape, dtype=np.bool_)
     line[polygon_perimeter(points[:, 0], points[:, 1], shape=tuple(shape), clip=True)] = True
@@ -145,8 +144,7 @@ def centre_of(nodule: Mask, grid: Grid) -> Float:
     low, high = bounds(nodule)
     part = np.asfortranarray(largest_piece(nodule[window(low, high)]))
     depth = edt.edt(part, anisotropy=tuple(map(float, grid.spacing_mm)), order="F", black_border=True)
-    deepest = np.unravel_index(int(np.argmax(depth)), depth.shape)
-    return grid.lps(low + np.asarray(deepest))
+    return grid.lps(low + np.asarray(np.unravel_index(int(np.argmax(depth)), depth.shape)))
 
 
 def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
@@ -160,8 +158,7 @@ def without_nodule(vessels: Mask, nodule: Mask, grid: Grid) -> Mask:
     cleared = np.array(vessels, dtype=np.bool_, order="F")
     if not nodule.any():
         return cleared
-    pad = np.ceil((RIM_MM + 2.0 * ATTACHED_MM) / grid.spacing_mm).astype(np.int64)
-    box = window(*bounds(nodule, pad))
+    box = window(*bounds(nodule, np.ceil((RIM_MM + 2.0 * ATTACHED_MM) / grid.spacing_mm).astype(np.int64)))
     distance = distance_mm(~nodule[box], grid.spacing_mm)
     gone = distance <= RIM_MM
     pieces, count = ndimage.label(cleared[box] & ~gone)

@@ -259,8 +259,7 @@ def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int
     from scipy.spatial import KDTree
 
     # Files store points in single precision; true neighbours are a hundred times farther apart.
-    same = KDTree(points).query_pairs(1e-3, output_type="ndarray")
-    label = _piece_of_points(len(points), same)
+    label = _piece_of_points(len(points), KDTree(points).query_pairs(1e-3, output_type="ndarray"))
     _, first, index = np.unique(label, return_index=True, return_inverse=True)
     # Numbered by first occurrence, so that the order of the file is kept.
     order = np.argsort(first)

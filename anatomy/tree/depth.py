@@ -32,8 +32,7 @@ def segments_inside(lumen: Bool, begin_ijk: Float, end_ijk: Float) -> Bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (planes - begin_ijk[:, :, None]) / step[:, :, None]
     t = np.clip(np.nan_to_num(t, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0).reshape(len(step), -1)
-    ends = np.broadcast_to(np.array([0.0, 1.0]), (len(step), 2))
-    t = np.sort(np.concatenate((ends, t), axis=1), axis=1)
+    t = np.sort(np.concatenate((np.broadcast_to(np.array([0.0, 1.0]), (len(step), 2)), t), axis=1), axis=1)
     t = np.concatenate((t, (t[:, 1:] + t[:, :-1]) / 2), axis=1)
     samples = begin_ijk[:, None] + t[:, :, None] * step[:, None]
     return np.asarray(inside(lumen, samples[:, :, None] + _SIGNS).all(axis=(1, 2)))

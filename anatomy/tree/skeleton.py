@@ -128,8 +128,7 @@ def span(
     # The spanning tree leaves out edges that cost nothing, as it does those that are not there.
     cost = np.clip(cost, 1e-300, 1e300)
     # Older versions of scipy (1.13 to 1.16) span graphs with indices of 32 bits only.
-    edges = a.astype(np.int32), b.astype(np.int32)
-    graph = coo_array((cost, edges), shape=(len(mm), len(mm))).tocsr()
+    graph = coo_array((cost, (a.astype(np.int32), b.astype(np.int32))), shape=(len(mm), len(mm))).tocsr()
     spanned = minimum_spanning_tree(graph).tocoo()
     neighbours: list[list[int]] = [[] for _ in range(len(mm))]
     chosen = set()
@@ -138,8 +137,7 @@ def span(
         neighbours[q].append(p)
         chosen.add((min(p, q), max(p, q)))
     tree = SkeletonTree(ijk=np.zeros((len(mm), 3), np.int64), mm=mm, depth_mm=depth_mm, neighbours=neighbours)
-    left_out = [(p, q) for p, q in pairs.tolist() if (p, q) not in chosen]
-    return tree, _rings(tree, left_out)
+    return tree, _rings(tree, [(p, q) for p, q in pairs.tolist() if (p, q) not in chosen])
 
 
 def _rings(tree: SkeletonTree, left_out: list[tuple[int, int]]) -> list[tuple[int, int, float]]:
@@ -162,9 +160,8 @@ def _rings(tree: SkeletonTree, left_out: list[tuple[int, int]]) -> list[tuple[in
         nodes = around + back[::-1]
         if len(nodes) < LOOP_EDGES:
             continue
-        others = begins[: len(rings)]
         # Rings that begin nearer to each other are one: a wide contact of two airways closes many.
-        if not (np.linalg.norm(others - tree.mm[p], axis=1) < 3.0).any():
+        if not (np.linalg.norm(begins[: len(rings)] - tree.mm[p], axis=1) < 3.0).any():
             begins[len(rings)] = tree.mm[p]
             rings.append((p, q, tree.length_mm([*nodes, p])))
     return rings
@@ -221,8 +218,7 @@ def _protrusion(tree: SkeletonTree, end: int, reach_mm: Float, alive: Bool) -> f
         return float("inf")
     rest = alive.copy()
     rest[nodes[:-1]] = False
-    distance = np.linalg.norm(tree.mm[rest] - tree.mm[end], axis=1)
-    return float((distance - reach_mm[rest]).min())
+    return float((np.linalg.norm(tree.mm[rest] - tree.mm[end], axis=1) - reach_mm[rest]).min())
 
 
 BEYOND_RADII = 3.0

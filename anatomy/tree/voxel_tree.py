@@ -132,8 +132,7 @@ def _kept_inside(voxel_tree: VoxelTree, base: Float, wanted: Float, lumen: Bool)
         bad &= (share[parent] > 0) | (share[child] > 0)
         if not bad.any():
             return replace(voxel_tree, ijk=ijk)
-        touched = np.unique(np.concatenate((parent[bad], child[bad])))
-        share[touched] /= 2
+        share[np.unique(np.concatenate((parent[bad], child[bad])))] /= 2
         # A step that leaves the lumen is halved so often before it is given up: a sixteenth of it is nothing.
         share[share < 0.5**4] = 0.0
 
@@ -172,8 +171,7 @@ def unite_parallel(voxel_tree: VoxelTree, lumen: Bool) -> VoxelTree:
 
 def _shared(voxel_tree: VoxelTree, kept: list[int], line: list[int], lumen: Bool) -> tuple[int, int]:
     """Return where on `kept` a line leaves it, and how many of its nodes run beside it until there."""
-    gap = np.abs(voxel_tree.ijk[line][:, None] - voxel_tree.ijk[kept]).max(axis=2)
-    beside = (gap <= 1.0).any(axis=1)
+    beside = (np.abs(voxel_tree.ijk[line][:, None] - voxel_tree.ijk[kept]).max(axis=2) <= 1.0).any(axis=1)
     most = len(line) - 1 if beside.all() else int(np.argmin(beside))
     for shared in range(min(most, len(line) - 1), 0, -1):
         if voxel_tree.across_gap[line[: shared + 1]].any():

@@ -190,8 +190,7 @@ class PlaceOptions:
             return StatedPlace(kind="exit", lps_mm=_point(self.exit), within_mm=self.exit_within)
         if self.scope_tip is None:
             return None
-        point = _point(self.scope_tip)
-        return StatedPlace(kind="scope tip", lps_mm=point, within_mm=self.scope_tip_within)
+        return StatedPlace(kind="scope tip", lps_mm=_point(self.scope_tip), within_mm=self.scope_tip_within)
 
 
 def _point(text: str) -> lazy.Float:

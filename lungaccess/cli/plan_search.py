@@ -124,8 +124,7 @@ def plan_and_report(lung: lazy.Lung, job: PlanJob) -> ExitCode:
     """
     request = job.asked.request(lung, job.target.resolve(lung))
     goal, limits = request.goal, request.limits
-    display = SearchDisplay(limits.time_s, limits.iterations, goal.words)
-    best, history = run_search(request, job, display)
+    best, history = run_search(request, job, SearchDisplay(limits.time_s, limits.iterations, goal.words))
     # After the search: the first plan does not wait for these.
 
     found = best if best.window is not None else lazy.with_window(best, lung)
@@ -244,8 +243,7 @@ def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
 def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
     """Return step by step what hands do with the bronchoscope."""
 
-    steps = lazy.scope_steps(plan, lung)
-    rows = [(str(number), one.text) for number, one in enumerate(steps, start=1)]
+    rows = [(str(number), one.text) for number, one in enumerate(lazy.scope_steps(plan, lung), start=1)]
     rows += [
         (f"pass {number}", f"{said[:1].upper()}{said[1:]}.")
         for number, said in enumerate(plan.redirections, 2)
@@ -281,8 +279,7 @@ def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
         (f"{n}", f"{math.degrees(roll):.1f}", f"{length:.2f}", f"{1.0 / bend:.1f}" if bend else "straight")
         for n, (length, roll, bend) in enumerate(arcs, start=1)
     ]
-    headings = ("", "roll first, deg", "insert, mm", "radius, mm")
-    return terminal.table("arcs of the needle", headings, rows)
+    return terminal.table("arcs of the needle", ("", "roll first, deg", "insert, mm", "radius, mm"), rows)
 
 
 def show_findings(appraisal: lazy.Appraisal) -> None:

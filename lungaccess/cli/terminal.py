@@ -136,8 +136,7 @@ def table(title: str, headings: Iterable[str], rows: Iterable[Row], caption: str
     made = bare_table(title)
     made.caption, made.caption_justify = caption, "left"
     for number, heading in enumerate(headings):
-        cells = [row[number] for row in listed]
-        numeric = number > 0 and all(_is_number(cell) for cell in cells if cell)
+        numeric = number > 0 and all(_is_number(row[number]) for row in listed if row[number])
         made.add_column(heading, justify="right" if numeric else "left", overflow="fold")
     for row in listed:
         made.add_row(*row)

@@ -161,9 +161,8 @@ def alternatives(
 
     Parameters and errors are those of `plan` and of `lungaccess.planning.diverse_plans.alternatives`.
     """
-    request = Request.of(lung, system, target, **asked)
     return answer_with_several(
-        request, count=count, separation_mm=separation_mm,
+        Request.of(lung, system, target, **asked), count=count, separation_mm=separation_mm,
         atlas_of=None if atlas is None else lambda _system: atlas,
         counterfactuals=counterfactuals, on_progress=on_progress,
     )  # fmt: skip

@@ -382,14 +382,12 @@ def branch_name(lung: Lung, branch: int) -> str:
 
 
 def _side(tree: AirwayTree, branch: int) -> str:
-    end = tree.points_lps[tree.branch_points(branch)[-1]]
-    return "left" if end[0] > tree.carina_lps[0] else "right"
+    return "left" if tree.points_lps[tree.branch_points(branch)[-1]][0] > tree.carina_lps[0] else "right"
 
 
 def _ends(tree: AirwayTree, branch: int) -> Float:
     """Return the last points `(N, 3)` of the branches without children at or beyond a branch."""
-    beyond = branches_beyond(tree, int(tree.branch_start[branch]))
-    leaves = tree.leaf_branches[beyond[tree.leaf_branches]]
+    leaves = tree.leaf_branches[branches_beyond(tree, int(tree.branch_start[branch]))[tree.leaf_branches]]
     return tree.points_lps[tree.branch_start[leaves + 1] - 1]
 
 

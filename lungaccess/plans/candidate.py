@@ -49,8 +49,7 @@ def parts_in_tissue(
         tubes = _tubes_beyond(lps_from_scope_tip, deployment, begin_mm)
         ends_mm = begin_mm + np.cumsum(tubes.arcs[:, LENGTH])
         middles_mm = ends_mm - 0.5 * tubes.arcs[:, LENGTH]
-        inserted = deployment.shape.insertions_mm[::-1].tolist()
-        radii = radii_at(system.tubes, inserted, middles_mm)
+        radii = radii_at(system.tubes, deployment.shape.insertions_mm[::-1].tolist(), middles_mm)
         for frame, arc, radius in zip(tubes.frames(), tubes.arcs, radii.tolist(), strict=False):
             parts.append(InTissue(ArcPath(lps_from_start=frame, arcs=arc), 2.0 * radius))
     if system.needle is not None:

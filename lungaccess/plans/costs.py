@@ -61,8 +61,7 @@ def _costs(
     obstacles, beyond = _obstacles(lung, with_fissures), path_beyond(path, wall_mm)
     found: dict[str, float] = {}
     for term in terms:
-        along = beyond if term.of_map else path
-        found |= needle.path_costs(obstacles, lung.cost, along, parts or [], [term])
+        found |= needle.path_costs(obstacles, lung.cost, beyond if term.of_map else path, parts or [], [term])
     return found
 
 

@@ -85,7 +85,6 @@ def device_curves(
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube), step_mm)
     start = tube.lps_from_tip if needle is None else needle.lps_from_start
     needle_poses, needle_mm = poses_on_pieces(start, needle_pieces(needle), step_mm)
-    needle_radius_mm = 0.0 if system.needle is None else system.needle.radius_mm
     return DeviceCurves(
         scope=DeviceCurve(
             name="scope",
@@ -104,7 +103,7 @@ def device_curves(
         needle=DeviceCurve(
             name="needle",
             lps_from_device=needle_poses,
-            radius_mm=np.full(len(needle_mm), needle_radius_mm),
+            radius_mm=np.full(len(needle_mm), 0.0 if system.needle is None else system.needle.radius_mm),
             arc_length_mm=needle_mm,
             colour=(0.1, 0.1, 0.1),
         ),

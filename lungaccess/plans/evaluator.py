@@ -190,8 +190,7 @@ class CandidateEvaluator:
         if isinstance(deployment, str):
             return None
         aim = self.aim(tip.lps_from_scope_tip[:3, 3]) if end is None else end
-        path = direct_path(deployment.lps_from_tip, aim)
-        return Candidate(tip=tip, deployment=deployment, path=path)
+        return Candidate(tip=tip, deployment=deployment, path=direct_path(deployment.lps_from_tip, aim))
 
     def reaches(self, lps_from_tip: Float) -> bool:
         """Tell whether the target lies in the needle's workspace at a start pose."""
@@ -231,13 +230,12 @@ class CandidateEvaluator:
         """The needle, its environment and the objective for the kernels."""
         costs, objective = self.task.lung.cost, self.objective
         unseen = costs is not None and not objective.looks_at_map and not np.isfinite(costs.array).all()
-        forbidden = costs.array if unseen and costs is not None else NO_MAP
         return NeedleArrays(
             self.environment.obstacles,
             self.environment.limits,
             self.environment.objective_arrays(objective),
             unseen,
-            forbidden,
+            costs.array if unseen and costs is not None else NO_MAP,
             objective.arrays_of_tubes(None if costs is None else costs.array),
         )
 

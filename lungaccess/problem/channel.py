@@ -25,8 +25,7 @@ def bends_with_tubes_rad(system: System) -> tuple[float, float]:
     The handle bends an empty section up to `bend_down_deg` and `bend_up_deg`.
     """
     tubes, scope = system.tubes, system.scope
-    reach_mm = scope.bending_length_mm + tubes.max_extension_mm
-    factor = _factor(system, np.zeros(len(tubes.nested)), reach_mm)
+    factor = _factor(system, np.zeros(len(tubes.nested)), scope.bending_length_mm + tubes.max_extension_mm)
     down, up = scope.bends_rad
     return (
         max(down, -math.radians(scope.bend_down_deg) / factor),

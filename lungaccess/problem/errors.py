@@ -394,8 +394,7 @@ class ErrorModel:
 
 def _listed(term: Term) -> str:
     """Return the bias of a term in words."""
-    unit = {"deg": "°"}.get(term.unit, f" {term.unit}")
-    return " / ".join(f"{each:g}" for each in term.bias) + unit
+    return " / ".join(f"{each:g}" for each in term.bias) + {"deg": "°"}.get(term.unit, f" {term.unit}")
 
 
 def with_known(errors: ErrorModel, kind: str, size: float) -> ErrorModel:

@@ -320,11 +320,10 @@ def with_least_clearance(system: System, least_clearance_mm: float) -> System:
         )
     if more <= 0.0:
         return system
-    margin_mm = system.margins.registration_margin_mm + more
     return replace(
         system,
         name=f"{system.name} (at least {least_clearance_mm:g} mm from obstacles)",
-        margins=replace(system.margins, registration_margin_mm=margin_mm),
+        margins=replace(system.margins, registration_margin_mm=system.margins.registration_margin_mm + more),
     )
 
 

@@ -255,5 +255,4 @@ def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
 def _free_tissue(lung: Lung, point: Float) -> str:
     """Name tissue that is no structure."""
     nodules = lung.nodules
-    in_nodule = nodules is not None and bool(nodules.at(point, False))
-    return "nodule" if in_nodule else "lung tissue"
+    return "nodule" if nodules is not None and nodules.at(point, False) else "lung tissue"

@@ -175,11 +175,10 @@ def kernel_cache() -> dict[str, Any]:
     names = [folders.module_folder(each, sources.stamp(each) or "") for each in modules]
     places = folders.code_folders()
     files = [file for place in places for file in place.rglob("*.code")]
-    there = {file.parent.name for file in files}
     return {
         "folders": [str(place) for place in places],
         "modules": len(names),
-        "warm": len(there.intersection(names)),
+        "warm": len({file.parent.name for file in files}.intersection(names)),
         "size_bytes": sum(file.stat().st_size for file in files),
         "digest": kernel_digest(),
         "writable": look_at(folders.kernels_folder())["writable"],

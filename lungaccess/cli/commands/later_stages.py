@@ -59,8 +59,7 @@ def replan(
     """
     if plan is not None or errors.procedure is not None:
         poses = {"scope": scope, "tubes": tube, "needle": needle}
-        followed = _Followed(plan, errors, placement, radius, record)
-        return _decided(patient, poses, frame, followed, output)
+        return _decided(patient, poses, frame, _Followed(plan, errors, placement, radius, record), output)
 
     Objective.of(objective)
     stated, device = target.stated(), system.load()

@@ -154,10 +154,9 @@ def _comparison_table(maps: tuple[lazy.ReachMap, ...]) -> Table:
         for each in maps
         for gained, lost in [each.gained_and_lost_ml(first)]
     ]
-    names = [row.name for row in first.by_region()]
     headings = (
-        "system", "scope, mm", "needle, mm", "radius, mm", *(f"{name}, %" for name in names), "gained, mL",
-        "lost, mL",
+        "system", "scope, mm", "needle, mm", "radius, mm", *(f"{row.name}, %" for row in first.by_region()),
+        "gained, mL", "lost, mL",
     )  # fmt: skip
     return terminal.table("Share reached; volume gained and lost beside the first", headings, rows)
 

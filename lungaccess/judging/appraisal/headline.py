@@ -124,7 +124,6 @@ class Headline:
         geometry = Geometry.PROVED if report.accepted else Geometry.REFUSED
         unchecked = {each.name: each.detail for each in report.unchecked}
         chances = {each.name: each.value for each in report.findings}
-        has_aim = any(each.name == "window.of_aim" for each in report.findings)
         return cls(
             geometry=geometry,
             refusals=len(report.refusals),
@@ -133,7 +132,7 @@ class Headline:
             fissure_chance=chances.get("fissure.chance"),
             needle_load=unchecked.get(NEEDLE_LOAD, ""),
             without_measuring=without_measuring,
-            has_aim=has_aim,
+            has_aim=any(each.name == "window.of_aim" for each in report.findings),
         )
 
     @property

@@ -63,8 +63,7 @@ def labels_at(lung: "Lung", points_lps: Float) -> Labels:
     """Return the labels `(N,)` of the voxels that hold the points; beyond the grid all is OUTSIDE."""
     points = np.asarray(points_lps, dtype=np.float64).reshape(-1, 3)
     axes = lung.grid.lps_from_ijk[:3, :3]
-    fraction = np.linalg.solve(axes, (points - lung.grid.lps_from_ijk[:3, 3]).T).T
-    index = np.rint(fraction).astype(np.int64)
+    index = np.rint(np.linalg.solve(axes, (points - lung.grid.lps_from_ijk[:3, 3]).T).T).astype(np.int64)
     inside = ((index >= 0) & (index < np.asarray(lung.labels.shape))).all(axis=1)
     labels = np.full(len(points), structures.OUTSIDE, dtype=np.uint16)
     labels[inside] = lung.labels[tuple(index[inside].T)]
@@ -219,8 +218,7 @@ def _bodies(key: int, labels: Labels) -> Labels:
     if key == NOT_LUMEN:
         return np.asarray((labels & structures.LUMEN) == 0, dtype=np.uint16)
     mask = (labels & key) != 0
-    names = branch_of(labels) + 2 if key == structures.AIRWAY else mask
-    return np.where(mask, names, 0).astype(np.uint16)
+    return np.where(mask, branch_of(labels) + 2 if key == structures.AIRWAY else mask, 0).astype(np.uint16)
 
 
 def on_surface(body: Labels) -> Bool:
@@ -384,5 +382,4 @@ class Environment:
     def nearest_tree_points(self, point_lps: Float, count: int) -> Int:
         """Return the indices of the tree points nearest to a point `(3,)`, the nearest first."""
         count = min(count, self.lung.tree.n_points)
-        found = self._tree_points.query(point_lps, k=np.arange(1, count + 1))[1]
-        return np.asarray(found, dtype=np.int64)
+        return np.asarray(self._tree_points.query(point_lps, k=np.arange(1, count + 1))[1], dtype=np.int64)

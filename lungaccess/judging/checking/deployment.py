@@ -83,8 +83,7 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
         most = float(passed.max(initial=0.0))
         for end in (max(at - STEP_MM, 0.0), at):
             rest = max(k for begin, stop, k in bent_at_rest(tube) if begin <= end <= stop)
-            factor = slots_at(tube.slotted_segments, end)[1]
-            yield 0.5 * tube.outer_diameter_mm * factor * (most + rest)
+            yield 0.5 * tube.outer_diameter_mm * slots_at(tube.slotted_segments, end)[1] * (most + rest)
 
 
 def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
@@ -168,8 +167,7 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> F
     if way_out is not None:
         curve = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.cut_at(pieces, way_out.arc_mm))
         way_out = replace(way_out, frame=int(np.abs(curve.arc_mm - way_out.arc_mm).argmin()))
-        labels = labels_at(lung, curve.points)
-        _check_containment(plan, curve, labels, way_out, found)
+        _check_containment(plan, curve, labels_at(lung, curve.points), way_out, found)
         _check_out_of_lumen(environment, curve, way_out, found)
         _check_clearance(plan, environment, curve, way_out, beside_mm, found)
         check_wall_run(plan, environment, curve, way_out, found)
@@ -264,9 +262,8 @@ def _check_clearance(
     ]
     for name, select, first in structures_known(cases, "tube", environment.lung, found):
         boxes = environment.boxes(select, REACH_MM)
-        points = curve.points[first:]
         least = check_clear(
-            f"tube.clearance.{name}", boxes, points, needed[first:], found,
+            f"tube.clearance.{name}", boxes, curve.points[first:], needed[first:], found,
             limited=name != "fissure" or plan.fissures_are_obstacles,
         )  # fmt: skip
         most = PathDistances(boxes, curve.points[way_out.frame :]).least_mm()

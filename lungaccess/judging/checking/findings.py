@@ -208,8 +208,7 @@ LENGTH_TOLERANCE_MM = 1e-6
 
 def angle_between(a: Float, b: Float) -> Float:
     """Return the angles in rad between vectors `(..., 3)`, accurate for small ones too."""
-    sine = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.asarray(np.arctan2(sine, (a * b).sum(axis=-1)))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(axis=-1)))
 
 
 def check_rigid(name: str, pose: Float, found: Findings) -> bool:

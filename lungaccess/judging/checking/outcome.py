@@ -102,8 +102,7 @@ def check_target(plan: Plan, lung: Lung, end: Float, found: Findings) -> None:
         found.at_most("target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the devices to the target")
     label = int(labels_at(lung, plan.target_lps)[0])
     found.true("target.in_lung", not label & structures.OUTSIDE, "the target is lung")
-    forbidden = forbidden_bits(plan)
-    found.true("target.free", not label & forbidden, "the target lies in no obstacle")
+    found.true("target.free", not label & forbidden_bits(plan), "the target lies in no obstacle")
 
 
 def _in_nodule(lung: Lung, points: Float) -> bool:
@@ -158,8 +157,7 @@ def objective_weights(objective: str) -> dict[str, float] | None:
             weights[name] = float(weight) if equals else 1.0
         except ValueError:
             return None
-    in_range = all(0.0 < weight < np.inf for weight in weights.values())
-    return weights if in_range else None
+    return weights if all(0.0 < weight < np.inf for weight in weights.values()) else None
 
 
 def inverse_clearance(plan: Plan, environment: Environment, curve: Curve) -> float:

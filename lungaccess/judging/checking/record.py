@@ -154,8 +154,7 @@ def _check_lengths(plan: Plan, found: Findings) -> bool:
     states = plan.scope.states
     usable &= 0 < len(states) <= MAX_STATES and float(np.abs(states[:, 1:]).max()) <= MAX_ANGLE_RAD
     usable &= float(np.abs(states[:, 0]).max()) <= MAX_TOTAL_MM
-    curvatures = [arc.curvature_per_mm for arc in arcs]
-    usable &= float(np.abs(curvatures).max(initial=0.0)) <= MAX_CURVATURE_PER_MM
+    usable &= float(np.abs([arc.curvature_per_mm for arc in arcs]).max(initial=0.0)) <= MAX_CURVATURE_PER_MM
     geometry = (plan.scope, plan.tube, plan.needle, plan.exemption, plan.target_lps)
     usable &= all(size <= MAX_NUMBER for part in geometry for _, size in _sizes(part, ""))
     return found.true("record.lengths", usable, "lengths positive, in order and not absurd")

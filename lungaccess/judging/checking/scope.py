@@ -86,8 +86,7 @@ class Motion:
         What draws back, which a motion must not, lays none.
         """
         moved = np.flatnonzero(self.advances > TINY_MM)
-        last = len(self.states) - 1
-        return np.append(moved, last), np.append(self.advances[moved], self.section_mm)
+        return np.append(moved, len(self.states) - 1), np.append(self.advances[moved], self.section_mm)
 
     def body(self, step_mm: float) -> tuple[Float, Float]:
         """Return points `(N, 3)` of the body in the last state and their distances `(N,)` from the entry."""
@@ -313,8 +312,7 @@ class Cells:
 
     def pick(self, which: Bool | Int) -> "Cells":
         """Return some of the cells."""
-        parts = {name: value[which] for name, value in vars(self).items()}
-        return Cells(**parts)
+        return Cells(**{name: value[which] for name, value in vars(self).items()})
 
     def halves(self, in_time: Bool) -> "Cells":
         """Cut every cell in two, along time where asked for, else along the arc."""
@@ -361,8 +359,7 @@ def first_cells(motion: Motion) -> Cells:
     advance = motion.states[:, 0]
     slides, lengths = begins, advance[ends] - advance[begins] + motion.section_mm
     in_place = np.flatnonzero(motion.turns)
-    last = len(motion.states) - 1
-    states = np.concatenate([slides, in_place, [last]])
+    states = np.concatenate([slides, in_place, [len(motion.states) - 1]])
     total = np.concatenate([lengths, np.full(len(in_place) + 1, motion.section_mm)])
     half_time = np.concatenate([np.zeros(len(slides)), np.full(len(in_place), 0.5), [0.0]])
     order = np.argsort(states, kind="stable")
@@ -384,8 +381,7 @@ def places(motion: Motion, cells: Cells) -> Float:
     """Return the middles of cells, `(C, 3)` LPS mm."""
     after = np.minimum(cells.state + 1, len(motion.states) - 1)
     begin, end = motion.states[cells.state, 1:], motion.states[after, 1:]
-    still = cells.half_time == 0.0
-    time = np.where(still, 0.0, cells.time)[:, None]
+    time = np.where(cells.half_time == 0.0, 0.0, cells.time)[:, None]
     twist, bend = (begin + time * (end - begin)).T
     curvature = bend / motion.section_mm
     bends = curvature[:, None] * np.stack([np.cos(twist), np.sin(twist)], axis=1)

@@ -168,8 +168,7 @@ def radius_at(plan: Plan, arc_mm: Float) -> Float:
     radius = np.zeros(len(arc_mm))
     inserted = plan.tube.insertions_mm(plan.system.tubes)
     for (_name, tube), end_mm in reversed(list(zip(plan.system.tubes.named, inserted, strict=True))):
-        here = (arc_mm <= end_mm) | (radius == 0.0)
-        radius = np.where(here, 0.5 * tube.outer_diameter_mm, radius)
+        radius = np.where((arc_mm <= end_mm) | (radius == 0.0), 0.5 * tube.outer_diameter_mm, radius)
     return radius
 
 
@@ -179,5 +178,4 @@ def distance_to_polyline(points: Float, line: Float) -> Float:
     length = np.maximum((step**2).sum(axis=1), 1e-300)
     away = points[:, None, :] - start
     along = np.clip((away * step).sum(axis=2) / length, 0.0, 1.0)
-    gap = away - along[:, :, None] * step
-    return np.asarray(np.sqrt((gap**2).sum(axis=2).min(axis=1)))
+    return np.asarray(np.sqrt(((away - along[:, :, None] * step) ** 2).sum(axis=2).min(axis=1)))

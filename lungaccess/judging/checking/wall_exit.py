@@ -76,8 +76,7 @@ def check_exit(plan: Plan, lung: "Lung", curve: Curve, found: Findings) -> Exit 
     found.agrees("exemption.point", exemption.exit_point_lps, stated.point_lps, POSITION_TOLERANCE_MM, "mm")
     frame = int(np.searchsorted(curve.arc_mm, arc_mm, side="right")) - 1
     # At the stated point, if it is the same: between the two a voxel may enter or leave the ball.
-    here = np.asarray(stated.point_lps) if same else point
-    angle = wall_angle_rad(lung, here, curve.tangents[frame])
+    angle = wall_angle_rad(lung, np.asarray(stated.point_lps) if same else point, curve.tangents[frame])
     found.agrees("tube.exit.angle", stated.wall_angle_rad, angle, WALL_ANGLE_TOLERANCE_RAD, "rad")
     limit = float(np.deg2rad(plan.system.tubes.min_wall_angle_deg))
     found.at_least("tube.exit.angle.stated_limit", stated.wall_angle_rad, limit, "rad")
@@ -184,8 +183,7 @@ def wall_run_mm(plan: Plan, environment: Environment, curve: Curve, way_out: Exi
     behind = np.flatnonzero(curve.arc_mm[1:] > way_out.arc_mm + 1e-9)
     radius = radius_at(plan, curve.arc_mm[behind + 1] - 1e-9)
     walls = environment.boxes(has(structures.AIRWAY), float(radius.max()) + 1.0)
-    ends = np.append(behind[:1], behind + 1)
-    distance = walls.distance_mm(curve.points[ends])
+    distance = walls.distance_mm(curve.points[np.append(behind[:1], behind + 1)])
     step = np.diff(curve.arc_mm)[behind]
     nearer = [np.clip(radius - each, 0.0, step) for each in (distance[:-1], distance[1:])]
     # A planner may count steps of half of this in which the body comes as near as half of this to the wall.

@@ -204,8 +204,7 @@ class _Devices:
 
 
 def _between(curve: Curve, begin: float, end: float) -> Float:
-    inside = (curve.arc_mm >= begin - ROUNDING) & (curve.arc_mm <= end + ROUNDING)
-    return curve.points[inside]
+    return curve.points[(curve.arc_mm >= begin - ROUNDING) & (curve.arc_mm <= end + ROUNDING)]
 
 
 def _check_aim(plan: Plan, found: Findings) -> None:
@@ -270,13 +269,11 @@ def _check_clear(
     ]
     spare, worst, inside, airway = np.inf, "", 0, 0
     for part in devices.parts():
-        lever = devices.from_tip_mm(part.points)
-        kept = _kept_mm(part.required_mm, window.hysteresis, lever)
+        kept = _kept_mm(part.required_mm, window.hysteresis, devices.from_tip_mm(part.points))
         mesh = _surface(part, environment, breath, phases, float(np.max(kept)))
         for phase in phases:
             points = breath.carried(part.points, phase)
-            within = part.select(labels_at(environment.lung, breath.pulled_back(points, phase)))
-            inside += int(within.sum())
+            inside += int(part.select(labels_at(environment.lung, breath.pulled_back(points, phase))).sum())
             left = _least_spare(_deformed(mesh, breath, phase), points, kept)
             if left < spare:
                 spare, worst = left, f"{part.name} at phase {phase:.3f}"
@@ -360,7 +357,5 @@ def _touching(
     points = breath.carried(curve.points[first:], phase)
     needed = radius[first:] + plan.system.margins.total_mm + plan.tube.clearance_loss_mm + strays[first:]
     boxes = environment.boxes(has(forbidden_bits(plan) & ~structures.AIRWAY), float(needed.max()))
-    places = breath.pulled_back(points, phase)
-    mesh = boxes.surface_near(places, 1.5 * (float(needed.max()) + NEAR_MM))
-    gap = _gaps(_deformed(mesh, breath, phase), points)
-    return int((gap < needed - MESH_TOLERANCE_MM).sum())
+    mesh = boxes.surface_near(breath.pulled_back(points, phase), 1.5 * (float(needed.max()) + NEAR_MM))
+    return int((_gaps(_deformed(mesh, breath, phase), points) < needed - MESH_TOLERANCE_MM).sum())

@@ -219,8 +219,7 @@ def _most_turn(needle: Needle) -> float:
 
 def region_of(lung: Lung, point: Float) -> str:
     """Return the lobe that holds a point (3,) LPS mm, or the side of the carina where lobes are not known."""
-    side = "left lung" if point[0] > lung.tree.carina_lps[0] else "right lung"
-    return lung.lobe_at(point) or side
+    return lung.lobe_at(point) or ("left lung" if point[0] > lung.tree.carina_lps[0] else "right lung")
 
 
 def _first(found: Float) -> Float:
@@ -236,8 +235,7 @@ def _blockings(arcs: DirectArcs, found: Float, labels: Int) -> Iterator[Blocking
         points = _first(found)[mine]
         cells = np.floor(points / NEAR_MM).astype(np.int64)
         _cells, of_point, sizes = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        fullest = np.flatnonzero(of_point.ravel() == np.argmax(sizes))
-        centre = points[fullest].mean(axis=0)
+        centre = points[np.flatnonzero(of_point.ravel() == np.argmax(sizes))].mean(axis=0)
         away = np.linalg.norm(points - centre, axis=1)
         nearest = int(np.argmin(away))
         yield Blocking(
@@ -303,8 +301,7 @@ def map_starts(arcs: DirectArcs) -> StartMap:
     """Return the starts of an atlas with the reason why each one's direct arc fails."""
     entries, names = arcs.atlas.deployments, list(FAILS)
     why = np.full(entries.count, names.index(OUT_OF_REACH), dtype=np.int64)
-    blockers = arcs.blockers(arcs.in_workspace)[0]
-    labels, of_arc = np.unique(blockers, return_inverse=True)
+    labels, of_arc = np.unique(arcs.blockers(arcs.in_workspace)[0], return_inverse=True)
     codes = np.array([names.index(_reason(int(label))) for label in labels], dtype=np.int64)
     why[arcs.in_workspace] = codes[of_arc.ravel()] if len(labels) else why[arcs.in_workspace]
     counted = np.bincount(why, minlength=len(names))

@@ -235,8 +235,7 @@ class Explainer:
             atlas = self._atlas_of(system, self._alive_share)
         # Each preset is searched this long: those that reach the target mostly do so with a direct arc.
         asked = Request.by_cost(replace(task, system=system), limits=Limits(iterations=20))
-        plans = run(asked, atlas=atlas, counterfactuals=False)
-        tried.append(first_attempt(plans, system, self._checker))
+        tried.append(first_attempt(run(asked, atlas=atlas, counterfactuals=False), system, self._checker))
 
     def _needle_changes(self) -> None:
         self._keep(coupled.needle_changes(self._task, self._atlas))

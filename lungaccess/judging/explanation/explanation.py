@@ -68,8 +68,7 @@ class Surroundings:
 
     def reached(self, point: Float) -> bool:
         """Tell whether the simplest way from some entry of the atlas is proved clear to a point (3,)."""
-        found = self._scan.reach(point[None], np.zeros(1, dtype=np.uint64))
-        return int(found.kinds[0]) == DIRECT
+        return int(self._scan.reach(point[None], np.zeros(1, dtype=np.uint64)).kinds[0]) == DIRECT
 
     def nearest(self, alive: Callable[[], None]) -> Neighbour | None:
         """Return a plan to the nearest point found; None if there is none within the largest of RADII_MM.

@@ -247,8 +247,7 @@ def cost_bound(rng: scenes.Random) -> scenes.Case:
     for scale in (0.001, 0.01, 0.03, 0.1, 0.3):
         halves = scale * HALVES[2:5] * rng.uniform(0.3, 1.0, 3)
         boxes = np.zeros((8, deployment_box.BOX_COLUMNS))
-        middles = case.values[2:5] + rng.uniform(-1.0, 1.0, 3) * halves
-        boxes[0, ROTATION : INNER + 1] = middles
+        boxes[0, ROTATION : INNER + 1] = case.values[2:5] + rng.uniform(-1.0, 1.0, 3) * halves
         boxes[0, HALF + ROTATION : HALF + INNER + 1] = halves
         boxes[0, [HALF + deployment_box.ACROSS, HALF + deployment_box.UP]] = -1.0
         boxes[0, deployment_box.LOSS + ROTATION] = 1.0

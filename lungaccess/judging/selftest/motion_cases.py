@@ -115,8 +115,7 @@ def spare_mm(
 
     def least_mm(first: int, bits: int, kept_mm: float, last: int | None = None) -> float:
         voxels = grid.lps(np.argwhere((labels & bits) != 0))
-        apart = np.linalg.norm(points[first:last, None] - voxels, axis=-1)
-        at, voxel = np.nonzero(apart < FAR_MM)
+        at, voxel = np.nonzero(np.linalg.norm(points[first:last, None] - voxels, axis=-1) < FAR_MM)
         nearest = voxels[voxel]
         # Towards the device, by what is left, and back into the box, again and again.
         for _ in range(STEPS):

@@ -102,7 +102,6 @@ def _code_file(call: Mapping[str, Any]) -> Path | None:
 
 def _dispatcher(call: Mapping[str, Any]) -> tuple[Any, tuple[Any, ...]] | None:
     """Return the kernel and the types of a call, None if there is no such kernel or type any more."""
-
     try:
         kernel = getattr(import_module(call["module"]), call["function"])
         kinds = tuple(decoded(kind) for kind in call["kinds"])

@@ -73,7 +73,6 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
         radius_mm: (N,) float64.
         edges ((E, 2) int64): Pairs of points that are neighbours along a branch.
     """
-
     skeleton, report = spanned_graph(points_lps, radius_mm, edges)
     trunk = find_trachea(skeleton, np.eye(3))
     # Nodes with parents first, and the position of each one's parent among them.

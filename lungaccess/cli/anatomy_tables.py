@@ -44,13 +44,11 @@ if TYPE_CHECKING:
 
 def is_lung(organ: lazy.Organ) -> TypeIs[lazy.Lung]:
     """Tell whether an organ is a lung; a liver has neither tree nor lobes."""
-
     return isinstance(organ, lazy.Lung)
 
 
 def organ_record(lung: lazy.Organ) -> dict[str, Any]:
     """Return what was understood of a patient; a liver has neither tree nor lobes."""
-
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
         **picked(lung, "name kind key"),
@@ -137,7 +135,6 @@ def _airways(lung: lazy.Lung) -> dict[str, Any]:
 
 def lobe_voxels(lung: lazy.Lung) -> dict[str, int]:
     """Return how many voxels each lobe has; empty if the patient came without lobes."""
-
     if lung.lobes is None:
         return {}
     counts = np.bincount(lung.lobes.array.ravel(order="K"), minlength=len(lazy.LOBES) + 1)
@@ -184,7 +181,6 @@ def anatomy_tables(lung: lazy.Organ, *, details: bool = False) -> list[Table]:
 
 
 def _nodule_table(lung: lazy.Organ) -> Table:
-
     found = lazy.nodules_of(lung)
     labelled = bool(found) and found[0].is_label
     rows = [
@@ -278,7 +274,6 @@ def _patient_rows(lung: lazy.Organ) -> list[terminal.Row]:
 
 def _fissures(lung: lazy.Lung) -> str:
     """Return what is known of the fissures, in words."""
-
     if lung.fissure_band is None or not lung.has_fissures:
         return "known" if lung.has_fissures else "not known"
     counts = np.bincount(lung.fissure_band.array.ravel(order="K"), minlength=lazy.UNKNOWN + 1)

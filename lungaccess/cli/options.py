@@ -98,7 +98,6 @@ class CacheOptions(OutputOptions):
 
     def open_atlas(self, lung: lazy.Lung, system: lazy.System) -> lazy.Atlas:
         """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
-
         with progress("enumerating what scope and tubes can do") as shown:
             return lazy.open_atlas(lung, system, cache=self.cache, progress=shown.share)
 
@@ -124,14 +123,12 @@ class PatientOptions(CacheOptions):
 
     def load_plan(self, plan: Path, patient: Path) -> tuple[lazy.Plan, lazy.Lung]:
         """Return a plan and the lung that it was made for; PlanFileError if it was made for another."""
-
         stored, lung = lazy.Plan.load(plan), self.load(patient)
         stored.require_lung(lung)
         return stored, lung
 
     def load_organ(self, patient: Path, *, thick_slices: bool = False, refuse: bool = True) -> lazy.Organ:
         """Return a patient's lung or a liver of Med-RAD, and show what is being done; see `load_lung`."""
-
         accept = self.accept if refuse else None
         if not lazy.is_liver(patient):
             return load_lung(patient, self.cache, thick_slices, accept)
@@ -156,7 +153,6 @@ class TargetOptions:
 
     def stated(self) -> lazy.StatedTarget:
         """Return what the user states, before any patient is read; errors as of `stated_target`."""
-
         return lazy.stated_target(self.target, self.nodule)
 
 
@@ -195,7 +191,6 @@ class PlaceOptions:
 
 def _point(text: str) -> lazy.Float:
     """Return a point that a user states, or has saved in 3D Slicer, LPS mm."""
-
     saved = lazy.parse_reference(text)
     return lazy.parse_point(text) if saved is None else lazy.read_named_point(saved).lps_mm
 
@@ -216,7 +211,6 @@ class SystemOptions:
 
     def load(self) -> lazy.System:
         """Return the system, its rule about fissures replaced if stated; SettingsError if it is "auto"."""
-
         if self.system == AUTO:
             raise SettingsError(
                 f"This command does not choose a system (--system {AUTO})",
@@ -227,7 +221,6 @@ class SystemOptions:
 
     def candidates(self) -> tuple[lazy.System, ...]:
         """Return the systems to try, the least invasive first: one, or all presets if it is to be chosen."""
-
         if self.system == AUTO:
             return lazy.presets_by_invasiveness(fissures_allowed=self.allow_fissures)
         return (self.load(),)
@@ -269,7 +262,6 @@ class ErrorOptions:
 
     def load(self) -> lazy.ErrorModel:
         """Return the error model, the default one if none is given."""
-
         model = lazy.load_errors() if self.errors is None else lazy.load_errors(self.errors)
         for stated in self.known:
             kind, _equals, size = stated.partition("=")
@@ -289,7 +281,6 @@ class ErrorOptions:
 
     def given_procedure(self) -> lazy.Procedure | None:
         """Return the procedure, None if none is given."""
-
         return None if self.procedure is None else lazy.load_procedure(self.procedure)
 
 
@@ -366,7 +357,6 @@ class SearchOptions(BudgetOptions):
         place: StatedPlace | None = None,
     ) -> Asked:
         """Return all of a request but patient and target; SettingsError if anything in it is wrong."""
-
         if self.method not in lazy.planners():
             raise lazy.unknown_method(self.method)
         processes = self.processes or (lazy.usable_cores() if goal_of(self.goal) is SUCCESS else 1)

@@ -39,7 +39,6 @@ class CostHistory:
     """Collects how plans become better while a search runs; its clock is that of the planner."""
 
     def __init__(self, display: SearchDisplay, goal: lazy.Goal) -> None:
-
         self._point, self._goal, self._display, self._iteration = lazy.CostPoint, goal, display, 0
         self._best: float | None = None
         self.points: list[lazy.CostPoint] = []
@@ -87,7 +86,6 @@ def run_search(
     The first plan is saved as soon as it is found, and the best one at the end, whatever happens after.  An
     interruption from the keyboard ends the search early; the best plan so far is kept.
     """
-
     history = CostHistory(display, request.goal)
 
     def atlas_of(system: lazy.System) -> lazy.Atlas:
@@ -213,7 +211,6 @@ MARKS = {True: Text("ok", "green"), False: Text("refused", "bold red"), None: Te
 
 def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     """Return why there is no plan."""
-
     return {
         **lazy.made_by(),
         "found": False,
@@ -227,7 +224,6 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
 
 def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
     """Return the stages of a plan and its costs."""
-
     what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
     return [
         terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan, lung)),
@@ -242,7 +238,6 @@ def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
 
 def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
     """Return step by step what hands do with the bronchoscope."""
-
     rows = [(str(number), one.text) for number, one in enumerate(lazy.scope_steps(plan, lung), start=1)]
     rows += [
         (f"pass {number}", f"{said[:1].upper()}{said[1:]}.")
@@ -253,7 +248,6 @@ def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
 
 
 def _stage_rows(plan: lazy.Plan, lung: lazy.Lung) -> list[terminal.Row]:
-
     scope, tube, place = plan.scope, plan.tube, lazy.target_words(lung, plan.target_lps)
     way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
     return [
@@ -324,7 +318,6 @@ def command_with(options: Sequence[str]) -> str:
 
 def limits_table(appraisal: lazy.Appraisal) -> Table:
     """Return the limits that the plan comes nearest to; broken ones come first."""
-
     rows = [
         (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")
         for each in appraisal.limits[: lazy.SHOWN_LIMITS]

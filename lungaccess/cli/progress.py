@@ -64,7 +64,6 @@ class _Shown:
     """Whether this process has said that kernels are compiled."""
 
     def __enter__(self) -> Self:
-
         self._interrupted_words: str | None = None
         self._compilations = lazy.watching_compilations(self._compiling)
         self._compilations.__enter__()

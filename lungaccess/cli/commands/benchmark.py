@@ -60,7 +60,6 @@ def make(
         ct: Also the CTs, about 25 MB each; no rule needs them.
         tips: Also the scope tips, from which a planner without a bronchoscope of its own can start.
     """
-
     claim_folder(out, ())
     with progress("making synthetic patients") as shown:
         made = lazy.write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
@@ -106,7 +105,6 @@ def run(
         scheduler: Address of a running dask scheduler; this machine if not given.
         workers: How many processes on this machine.
     """
-
     devices_asked = {"systems": names_of(devices)} if devices is not None else {}
     study = lazy.benchmark_study(
         folder, names_of(methods), phantoms=names_of(phantoms), targets=targets, iterations=iterations,
@@ -128,7 +126,6 @@ def run(
 
 
 def _write_answers(results: Path, folder: Path) -> list[Path]:
-
     require_writable_folder(folder)
     written = []
     for each in lazy.submissions_of(results):
@@ -159,7 +156,6 @@ def score(
         only_answered: Leave out queries without an answer, which otherwise count as not solved.
         out: File for the scores of all queries: .json, from which `sheet` compares planners, or .csv.
     """
-
     if out is not None:
         lazy.require_table_file(out)
     handed_in = lazy.read_submission(submission)
@@ -195,7 +191,6 @@ def sheet(
         csv: Also write the sheet as a .csv or .json file.
         brief: One line a planner, without families and devices.
     """
-
     if not scores:
         raise SettingsError("No scores were given", expected="one or more files", remedy="Name scores.json")
     rows = [each for path in scores for each in lazy.read_scores(path)]
@@ -208,13 +203,11 @@ def sheet(
 @synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} schema"))
 def schema() -> ExitCode:
     """Print the JSON Schema of a submission."""
-
     terminal.show_json(lazy.submission_schema())
     return ExitCode.OK
 
 
 def _show_sheet(scores: list[lazy.Score], output: OutputOptions, *, by_family: bool = True) -> None:
-
     lines = lazy.score_sheet(scores, by_family=by_family)
     about = {"benchmark": NAME, "manifest_sha256": lazy.manifest_sha256()}
     refused = {each.query: each.reason for each in scores if each.reason}
@@ -263,7 +256,6 @@ def med_rad(
         peer: JSON file of another planner's recorded results, shown beside.
         out: File for all runs: .csv, or .json, which holds the arcs of the paths, too.
     """
-
     names = _planners(planners)
     device = system.load()
     radii = _radii(radius, rules, device)
@@ -305,7 +297,6 @@ def _rows(
     output: PatientOptions,
 ) -> Iterator[lazy.BenchmarkRow]:
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
-
     paths = list(lazy.patients_of(folder))
     for path in paths:
         try:
@@ -327,7 +318,6 @@ def _rows(
 def _posing(
     path: Path, rules: Rules, device: lazy.System, output: PatientOptions
 ) -> tuple[lazy.Pose, lazy.Organ | lazy.PatientImages | lazy.LiverImages]:
-
     if rules == "ours":
         lung = output.load_organ(path)
         return lazy.posed_in_lung(lung, device), lung
@@ -339,7 +329,6 @@ def _posing(
 
 
 def _planners(text: str) -> tuple[str, ...]:
-
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if text == DEFAULT_PLANNERS and not lazy.has_ompl():
         names = tuple(name for name in names if name not in lazy.OMPL_PLANNERS)

@@ -48,7 +48,6 @@ def check(
         out: Where the plan with the edited needle goes if it is accepted.
         everything: List every finding, not only the nearest limits.
     """
-
     if curve is not None:
         if system or errors.errors or errors.procedure:
             raise SettingsError(
@@ -80,7 +79,6 @@ def check(
 def _check_curve(
     plan: Path, patient: Path, text: str, out: Path | None, output: PatientOptions, *, everything: bool
 ) -> ExitCode:
-
     saved = lazy.parse_reference(text)
     if saved is None:
         raise SettingsError(
@@ -200,7 +198,6 @@ def insert(
         film: WebP file for a film of the first needle, blindly and tracked.
         picture: PNG file for the true paths and tip errors of all.
     """
-
     passes = lazy.Plan.load(plan).passes
     if not 1 <= number <= len(passes):
         raise SettingsError(f"--pass is {number}", expected=f"a pass of the plan, 1 to {len(passes)}")

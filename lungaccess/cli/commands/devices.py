@@ -29,7 +29,6 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
     Args:
         show: Print the TOML file of this system: edit it, and hand it over with --system FILE.
     """
-
     if show is not None and not output.json:
         terminal.console.file.write(lazy.preset_text(show))
         return ExitCode.OK
@@ -83,7 +82,6 @@ def tubes(
         propose: Compare sequences to the same place, and look for designs that sweep less.
         out: PNG file for the picture.
     """
-
     require_picture(out)
     answer = lazy.deploy_tubes(
         lazy.load_tubes(system),
@@ -207,7 +205,6 @@ def _design_table(present: lazy.DesignProposal, choices: tuple[lazy.DesignPropos
 
 
 def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
-
     written = lazy.tubes_record(answer)
     if propose:
         comparison = lazy.compare_sequences(answer)
@@ -223,7 +220,6 @@ def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
 
 
 def _proposal(proposal: lazy.DesignProposal) -> dict[str, object]:
-
     return {
         **picked(proposal, "lateral_sweep_mm tip_offset_mm tip_angle_rad"),
         "outer": lazy.to_mapping(proposal.tubes.outer),
@@ -232,7 +228,6 @@ def _proposal(proposal: lazy.DesignProposal) -> dict[str, object]:
 
 
 def _draw(answer: lazy.TubeAnswer, out: Path) -> None:
-
     keep_earlier(out)
     deployed = answer.deployed
     notes = [
@@ -270,7 +265,6 @@ def shapes(
             innermost first.
         out: CSV file for a table of all shapes.
     """
-
     device = lazy.load_tubes(system)
     found = lazy.design_shapes(device, cache=output.cache)
     if out is not None:
@@ -285,7 +279,6 @@ def shapes(
 
 
 def _shapes_rows(name: str, found: lazy.TubeShapes) -> list[terminal.Row]:
-
     record = lazy.shapes_record(name, found)
     turns = record["relative_rotations"]
     turned = f"{turns} relative rotations" if turns > 1 else "no relative rotation"
@@ -333,7 +326,6 @@ def design(
         scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
         workers: How many processes on this machine; as many as it has cores if not given.
     """
-
     asked = lazy.read_design(design) if design else lazy.design_of(tomllib.loads(template_text("design")))
     claim_folder(out, ())
     with progress(asked.study.name) as shown:

@@ -110,7 +110,6 @@ def stream(
         loop: Begin the motion again when it has ended.
         seconds: End after so long; until Ctrl-C if not given.
     """
-
     stored = lazy.Plan.load(plan)
     with lazy.Link(host, port, connects=connect) as link:
         lung = output.load(patient)
@@ -243,7 +242,6 @@ def template_text(kind: Kind) -> str:
 
 def schema_text(kind: Kind) -> str:
     """Return the JSON Schema of the files of a kind; SettingsError if its files have no keys."""
-
     if kind not in SCHEMAS:
         raise SettingsError(f"Files of the kind {kind} have no keys", expected=f"one of {', '.join(SCHEMAS)}")
     module, name = SCHEMAS[kind].split(":")

@@ -167,7 +167,6 @@ def kernel_cache() -> dict[str, Any]:
     which new code is kept, if it can be written.  The size is that of all code there, also of other sources.
     numba is not imported for it, so that the answer comes at once, and also where numba is broken.
     """
-
     from anatomy.machine_code import folders
 
     sources = lazy.Sources()
@@ -208,7 +207,6 @@ def selftest(
     Args:
         kind: Kinds of proofs, as the table names them; all of them if not given.
     """
-
     with progress("proofs") as shown:
         outcomes = lazy.self_test(kind, progress=shown.step)
     output.tell([{**asdict(each), "held": each.held} for each in outcomes])
@@ -276,7 +274,6 @@ def prune(
         older_than: Days without use after which something goes.
         max_size: What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.
     """
-
     most = cache_limit_bytes() if max_size is None else parse_size(max_size, "--max-size")
     found = _entries(output.cache or default_cache())
     return _remove(lazy.overdue(found, most_bytes=most, older_than_days=older_than), output)
@@ -290,7 +287,6 @@ def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
 
 
 def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
-
     formats = {
         "anatomy": lazy.stored_format(),
         "atlas": lazy.atlas_format(),
@@ -301,7 +297,6 @@ def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
 
 
 def _remove(entries: Iterable[lazy.CacheEntry], output: CacheOptions) -> ExitCode:
-
     gone = []
     for entry in entries:
         lazy.remove_entry(entry)

@@ -99,7 +99,6 @@ def _decided(
     followed: _Followed,
     output: options.PatientOptions,
 ) -> ExitCode:
-
     procedure = followed.errors.given_procedure()
     if followed.plan is None or procedure is None:
         raise SettingsError(
@@ -139,7 +138,6 @@ def _measured(
 
 def _pose(given: str, stage: str, frame: options.FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:
     """Return a pose as it is stated, and the plan that it is of if it is one of a plan."""
-
     saved = lazy.parse_reference(given)
     if saved is not None:
         return lazy.read_named_pose(saved), None
@@ -150,7 +148,6 @@ def _pose(given: str, stage: str, frame: options.FrameOfPose) -> tuple[lazy.Floa
 
 
 def _replan_tables(found: lazy.RestOfPlan, *, has_map: bool) -> list[Table]:
-
     tube, needle = found.tube, found.needle
     rows = [] if tube is None else tube_rows(tube)
     rows += [
@@ -191,7 +188,6 @@ def tube_rows(tube: lazy.TubeDeployment) -> list[tuple[str, str]]:
 
 def decision_tables(decision: lazy.Decision) -> list[Table]:
     """Return what a policy says is to be done next."""
-
     rows = [("estimated chance of success so", f"{of_hundred(decision.chance)} of 100")]
     if decision.again:
         rows.append(("if the scope is placed again", f"{of_hundred(decision.again)} of 100"))
@@ -229,7 +225,6 @@ def needle(
             or a weighted sum such as length=1,cost-map=0.5.
         out: PNG file for a picture of start, path or blocked place, and target.
     """
-
     if out is not None:
         options.require_picture(out)
     stated, weighed = target.stated(), Objective.of(objective)
@@ -268,7 +263,6 @@ def needle(
 
 
 def _needle_tables(answer: lazy.NeedleAnswer, *, is_lung: bool) -> list[Table]:
-
     words = {
         "path": "a path, proved clear",
         "no path": "no path exists (proved against the masks)",
@@ -305,7 +299,6 @@ def _needle_tables(answer: lazy.NeedleAnswer, *, is_lung: bool) -> list[Table]:
 
 def _start_pose(lung: lazy.Organ, start: str, frame: options.FrameOfPose) -> lazy.Float:
     """Return a pose by its number among those of the patient, from a plan, or from a file of numbers."""
-
     if start.endswith(".json"):
         return lazy.Plan.load(start).tube.lps_from_tip
     names = [name.lower() for name in lung.start_names]

@@ -90,7 +90,6 @@ def segment(
             refusing.
         json: Print JSON, the content of quality.json, instead of tables.
     """
-
     for point in (target, seed, *nodule):
         if point is not None:
             parse_point(point)
@@ -234,7 +233,6 @@ def phantom(
         spacing: Edge of the voxels, mm; 1 for the adult, 1.25 for the small patient.
         breathing: Also motion.nrrd, how the lungs breathe; the masks show end-inhale.
     """
-
     require_empty_folder(out, force=force)
     with progress("making a synthetic patient"):
         made = lazy.make_phantom(seed=seed, spacing_mm=spacing, size=size)

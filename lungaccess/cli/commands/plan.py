@@ -57,14 +57,12 @@ def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) ->
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
     """
-
     # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
     images = lazy.make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
     return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
 def _first_reachable_nodule(lung: lazy.Lung, job: plan_search.PlanJob) -> ExitCode:
-
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
@@ -121,7 +119,6 @@ def plan(
             there is no plan: the nearest miss, what blocks, which preset or change of device would do, what
             is proved; 10 if not given, 0 to leave it out. One preset is tried however short the time is.
     """
-
     stated = target.stated()
     systems = lazy.systems_with_tool(system.candidates(), tool)
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
@@ -150,7 +147,6 @@ def explain_and_report(
 
     Plans of other systems are searched by `cost`; the time is that of `explain_no_plan` if None.
     """
-
     explanation = _explained(lung, job, failure, cost, time_s)
     written = lazy.save_explanation(explanation, job.out)
     if not job.output.json:
@@ -167,7 +163,6 @@ def explain_and_report(
 def _explained(
     lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> lazy.Explanation:
-
     system, cache = job.asked.systems[0], job.output.cache
 
     def atlas_of(other: lazy.System, on_share: Callable[[float], None]) -> lazy.Atlas:
@@ -194,7 +189,6 @@ def _explained(
 
 
 def _drawn(lung: lazy.Lung, job: plan_search.PlanJob, explanation: lazy.Explanation) -> tuple[str, ...]:
-
     with progress("drawing why there is no plan"):
         lazy.no_plan_png(explanation, lung, job.out / PICTURE)
     with progress("making the page"):
@@ -204,7 +198,6 @@ def _drawn(lung: lazy.Lung, job: plan_search.PlanJob, explanation: lazy.Explanat
 
 def show_explanation(explanation: lazy.Explanation) -> None:
     """Print the headline, then what was learned, the most useful first, then the counted reasons."""
-
     terminal.console.print(
         Panel(explanation.headline, title="no plan", title_align="left", border_style="yellow")
     )
@@ -254,7 +247,6 @@ def alternatives(
         separation: The needles of every two plans lie somewhere at least so many mm from each other.
         out: Folder for plan-01.json and so on, and trade_off.svg.
     """
-
     stated, systems = target.stated(), system.candidates()
     asked = search.asked(systems, errors.given(), errors.given_procedure())
     claim_folder(out, ("plan-*.json", TRADE_OFF), force=force)
@@ -288,7 +280,6 @@ def alternatives(
 
 
 def _show(lung: lazy.Lung, found: tuple[lazy.Alternative, ...], appraisals: list[lazy.Appraisal]) -> None:
-
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
     plan_search.show_headline(appraisals[best].headline)
@@ -314,7 +305,6 @@ def _success(appraisal: lazy.Appraisal) -> float:
 def _records(
     found: tuple[lazy.Alternative, ...], appraisals: list[lazy.Appraisal], out: Path, has_map: bool
 ) -> list[dict[str, object]]:
-
     return [
         {
             "plan": str(out / f"plan-{number:02d}.json"),

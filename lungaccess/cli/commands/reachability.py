@@ -43,7 +43,6 @@ def reach(
         out: Folder for the volumes, the pictures and reach.json.
         page: HTML file that shows the maps over slices and in 3-D, with the volumes; it opens offline.
     """
-
     others = (name.strip() for name in (compare or "").split(",") if name.strip())
     names = dict.fromkeys([system.system, *others])
     systems = [lazy.load_system(name, fissures_allowed=system.allow_fissures) for name in names]
@@ -90,7 +89,6 @@ def _stems(maps: tuple[lazy.ReachMap, ...]) -> list[str]:
 
 def record(reach: lazy.ReachMap) -> dict[str, object]:
     """Return the figures of a map as plain values."""
-
     system, needle = reach.system, reach.system.needle
     return {
         "patient": reach.patient_name,
@@ -112,7 +110,6 @@ def record(reach: lazy.ReachMap) -> dict[str, object]:
 
 
 def _plain(row: lazy.RegionReach) -> dict[str, object]:
-
     return {
         "name": row.name,
         "volume_ml": row.volume_ml,
@@ -124,7 +121,6 @@ def _plain(row: lazy.RegionReach) -> dict[str, object]:
 
 
 def _region_table(reach: lazy.ReachMap) -> Table:
-
     rows = [
         (
             row.name,
@@ -181,7 +177,6 @@ def certify(
         time_s: Seconds to look at them, after the preparation; the same time need not give the same answer.
         out: PNG file that shows what is ruled out and what is open.
     """
-
     if out is not None:
         options.require_picture(out)
     stated = target.stated()
@@ -241,7 +236,6 @@ def _percent(share: float) -> str:
 
 
 def _words(place: lazy.OpenPlace) -> str:
-
     return (
         f"branch {place.name}, generation {place.generation}, from {lazy.point(place.tip_lps)} (LPS mm): "
         f"{100.0 * place.share:.2g} % of the space"

@@ -183,7 +183,6 @@ def _tolerance_table(kept: tuple[lazy.Tolerance, ...]) -> Table:
 
 
 def _largest(tolerance: lazy.Tolerance) -> str:
-
     size = tolerance.largest
     more = "at least " if size >= lazy.LARGEST[tolerance.unit] else ""
     return f"{more}{size:.2f}"
@@ -196,7 +195,6 @@ def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
 
 def _estimate_record(report: lazy.RiskReport | lazy.ProcedureReport) -> dict[str, object]:
     """Return what estimates of single plans and of procedures have in common."""
-
     return {
         "errors": {**lazy.to_mapping(report.model), "name": report.model.label},
         **picked(report, "samples seed"),
@@ -210,7 +208,6 @@ def _estimate_record(report: lazy.RiskReport | lazy.ProcedureReport) -> dict[str
 
 def procedure_record(report: lazy.ProcedureReport) -> dict[str, object]:
     """Return a report as plain values."""
-
     return _estimate_record(report) | {
         "procedure": lazy.to_mapping(report.procedure),
         "ends": {name: share.to_mapping() for name, share in report.ends.items()},
@@ -281,7 +278,6 @@ def start_region(
         scope: Whether poses of the scope's tip are tried as well, which takes some seconds.
         seed: Seed of the search.
     """
-
     stored, lung = output.load_plan(plan, patient)
     with progress("trying start poses"):
         region = lazy.safe_start_region(

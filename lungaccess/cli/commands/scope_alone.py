@@ -37,7 +37,6 @@ def advise(
         seed: Seed of the random numbers.
         out: Folder for advice.json and camera.mrk.json, the flight of the camera for 3D Slicer.
     """
-
     stated = target.stated()
     claim_folder(out, (lazy.ADVICE_FILE, lazy.CAMERA_FILE), force=force)
     device = lazy.load_system(system)
@@ -115,7 +114,6 @@ def tour(
         per_lesion: Time that each lesion takes besides, s.
         out: Folder for tour.json and tour.png.
     """
-
     stated = None if targets is None else lazy.read_lesions(targets)
     claim_folder(out, ("tour.json", "tour.png"), force=force)
     device = lazy.load_system(system)
@@ -236,7 +234,6 @@ def route(
         pixel: Size of a pixel of a drawing, mm.
         out: Folder for route.json and route.png.
     """
-
     limits = lazy.RouteLimits(
         max_curvature_per_mm=curvature,
         device_radius_mm=radius,
@@ -284,7 +281,6 @@ def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
 
 
 def _verdict(found: lazy.Route) -> ExitCode:
-
     try:
         lazy.require_proved(found)
     except lazy.NoRouteError as error:

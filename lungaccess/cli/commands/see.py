@@ -47,7 +47,6 @@ def report(
         seed: Seed of that estimate; 0 if not given.
         instructions: Whether instructions for the scope are listed step by step.
     """
-
     page = plan.parent / "report.html" if out is None else out
     for file in (page, *([movie] if movie is not None else [])):
         require_writable_folder(file.parent)
@@ -88,7 +87,6 @@ def _others(plan: lazy.Plan, lung: lazy.Lung, count: int, output: PatientOptions
 
     Of a patient that breathes they have their windows.
     """
-
     target = lazy.Target(lps_mm=plan.target_lps, origin=plan.target_origin)
     atlas = output.open_atlas(lung, plan.system)
     try:
@@ -176,7 +174,6 @@ def view(
 
 def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = PatientOptions()) -> ExitCode:
     """Print step by step how the bronchoscope of a plan moves; with --json also every state, for motors."""
-
     stored, lung = output.load_plan(plan, patient)
     if output.json:
         terminal.show_json(lazy.motion_record(stored, lung))
@@ -200,7 +197,6 @@ def shown_ct(stated: Path | None, patient: Path) -> lazy.CtFile | None:
     Raises:
         FileError: If the record of the patient's segmentation is damaged.
     """
-
     found = lazy.find_ct(patient) if stated is None else lazy.CtFile(path=stated)
     if found is None or found.path.exists() or stated is not None:
         return found

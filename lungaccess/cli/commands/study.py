@@ -42,7 +42,6 @@ def run(
         scheduler: Address of a running dask scheduler, such as tcp://host:8786; this machine if not given.
         workers: How many processes on this machine; as many as it has cores if not given.
     """
-
     asked = lazy.read_study(study)
     with progress(asked.name) as shown:
         done = lazy.run_study(
@@ -74,7 +73,6 @@ def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
     Args:
         results: Results file.
     """
-
     groups = lazy.summarise(results)
     output.tell([asdict(group) for group in groups])
     terminal.show([_table(str(results), groups)])
@@ -96,7 +94,6 @@ def export(
         csv: Folder for runs.csv, progress.csv, findings.csv, rejections.csv and plans.csv.
         parquet: Folder for the same as Parquet.
     """
-
     if csv is None and parquet is None:
         raise SettingsError(
             "Nothing to export to was given",
@@ -118,7 +115,6 @@ def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions(
     Args:
         first, second: Results files.
     """
-
     found = lazy.differences(first, second)
     output.tell(found)
     for each in found:

@@ -107,7 +107,7 @@ def _breathing(lung: lazy.Organ) -> dict[str, Any]:
 
 
 def _airways(lung: lazy.Lung) -> dict[str, Any]:
-    tree, report = lung.tree, lung.tree.report
+    tree, named, report = lung.tree, lung.tree.bronchi, lung.tree.report
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
         "lobes_ml": {name: count * ml for name, count in lobe_voxels(lung).items()},
@@ -116,12 +116,8 @@ def _airways(lung: lazy.Lung) -> dict[str, Any]:
             "carina_lps": tree.carina_lps.tolist(),
             "branches_by_generation": np.bincount(tree.generation).tolist(),
             "bronchi": [
-                {
-                    "name": tree.bronchi.names[branch],
-                    "branch": branch,
-                    "confidence": float(tree.bronchi.confidence[branch]),
-                }
-                for branch in np.flatnonzero(tree.bronchi.starts).tolist()
+                {"name": named.names[branch], "branch": branch, "confidence": float(named.confidence[branch])}
+                for branch in np.flatnonzero(named.starts).tolist()
             ],
             "components_dropped": report.components_dropped,
             "voxels_dropped": report.voxels_dropped,
@@ -182,7 +178,6 @@ def anatomy_tables(lung: lazy.Organ, *, details: bool = False) -> list[Table]:
 
 def _nodule_table(lung: lazy.Organ) -> Table:
     found = lazy.nodules_of(lung)
-    labelled = bool(found) and found[0].is_label
     rows = [
         (
             f"{each.number}",
@@ -194,16 +189,15 @@ def _nodule_table(lung: lazy.Organ) -> Table:
         )
         for each in found
     ]
-    number = "label in the mask" if labelled else "number, by size"
+    number = "label in the mask" if found and found[0].is_label else "number, by size"
     diameters = ("diameter of a ball as large, mm", "long axis x across, mm")
     headings = (number, *diameters, "volume, ml", "centre, LPS mm", "place")
     return terminal.table("Nodules, for --nodule", headings, rows)
 
 
-def _bronchus_rows(lung: lazy.Lung) -> list[terminal.Row]:
-    """Return the named bronchi in the order of the tree, with what is measured of each."""
+def _tree_tables(lung: lazy.Lung, details: bool) -> list[Table]:
     tree, named = lung.tree, lung.tree.bronchi
-    return [
+    bronchi = [
         (
             named.names[branch],
             f"{branch}",
@@ -214,9 +208,6 @@ def _bronchus_rows(lung: lazy.Lung) -> list[terminal.Row]:
         )
         for branch in np.flatnonzero(named.starts).tolist()
     ]
-
-
-def _tree_tables(lung: lazy.Lung, details: bool) -> list[Table]:
     repairs = [
         (kind, ", ".join(f"{c:.1f}" for c in each.position_lps), f"{each.length_mm:.1f}")
         for kind, each in (_repairs(lung) if details else ())
@@ -225,7 +216,7 @@ def _tree_tables(lung: lazy.Lung, details: bool) -> list[Table]:
         terminal.table(
             "Bronchi with a name",
             ("bronchus", "branch", "generation", "mean diameter, mm", "length, mm", "confidence"),
-            _bronchus_rows(lung),
+            bronchi,
         ),
         terminal.table(
             "Airway tree",

@@ -185,14 +185,11 @@ def _answer(words: list[str]) -> int:
         return _explain(_TOO_LARGE, as_json)
     except OSError as error:
         return _explain(_unusable(error), as_json)
-    except KeyboardInterrupt:
-        return _interrupted()
-    except ImportError as error:
-        # Compiled libraries turn an interruption of their loading into this.
-        if not isinstance(error.__cause__, KeyboardInterrupt):
-            return _crashed(error, words, as_json)
-        return _interrupted()
-    except Exception as error:
+    except (KeyboardInterrupt, Exception) as error:
+        # Compiled libraries turn an interruption of their loading into an ImportError.
+        if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
+            error_console.print("interrupted")
+            return ExitCode.INTERRUPTED
         return _crashed(error, words, as_json)
     finally:
         result_folder.held.close()
@@ -205,11 +202,6 @@ def _crashed(error: Exception, words: list[str], as_json: bool) -> ExitCode:
     if as_json:
         terminal.show_json({"error": crash.to_mapping()})
     return ExitCode.CRASHED
-
-
-def _interrupted() -> ExitCode:
-    error_console.print("interrupted")
-    return ExitCode.INTERRUPTED
 
 
 def _explain(error: LungaccessError, as_json: bool) -> ExitCode:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from lungaccess.plans.costs import costs_in_words, known_costs
     from lungaccess.plans.file import plain, schema_of
     from lungaccess.plans.no_plan import NoPlan
-    from lungaccess.plans.parts import TubeDeployment
+    from lungaccess.plans.parts import NeedlePath, TubeDeployment
     from lungaccess.plans.plan import Plan
     from lungaccess.plans.scope_steps import handle_words, motion_record, scope_steps, steps_note
     from lungaccess.plans.version import made_by, software_kernels

@@ -224,9 +224,25 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
 
 def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
     """Return the stages of a plan and its costs."""
-    what = "the tubes beyond the lumen" if plan.needle is None else "the needle"
+    scope, tube, place = plan.scope, plan.tube, lazy.target_words(lung, plan.target_lps)
+    what, steer = ("the tubes beyond the lumen", "") if plan.needle is None else ("the needle", "steer ")
+    stages = [
+        (
+            "scope",
+            f"advance {scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
+            f"{scope.generation}",
+        ),
+        (
+            "tubes",
+            f"{plan.rotations}, {plan.insertions} beyond the scope; "
+            f"through the wall of branch {lung.branch_words(tube.exit.branch)}",
+        ),
+        ("needle", f"{steer}{plan.way_to_target}" + (f": {place}" if place else "")),
+        *((f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)),
+        *((("ultrasound", view),) if (view := lazy.view_words(plan, lung)) else ()),
+    ]
     return [
-        terminal.table("The stages", ("stage", "what to do"), _stage_rows(plan, lung)),
+        terminal.table("The stages", ("stage", "what to do"), stages),
         steps_table(plan, lung),
         terminal.table(
             f"Costs of {what} (made small: {Objective.of(plan.objective).words})",
@@ -245,26 +261,6 @@ def steps_table(plan: lazy.Plan, lung: lazy.Lung) -> Table:
     ]
     note = f"{lazy.handle_words(plan)} {lazy.steps_note(plan, lung)}"
     return terminal.table("The bronchoscope, step by step", ("step", "what to do"), rows, note)
-
-
-def _stage_rows(plan: lazy.Plan, lung: lazy.Lung) -> list[terminal.Row]:
-    scope, tube, place = plan.scope, plan.tube, lazy.target_words(lung, plan.target_lps)
-    way = plan.way_to_target if plan.needle is None else f"steer {plan.way_to_target}"
-    return [
-        (
-            "scope",
-            f"advance {scope.length_from_carina_mm:.1f} mm beyond the carina, to generation "
-            f"{scope.generation}",
-        ),
-        (
-            "tubes",
-            f"{plan.rotations}, {plan.insertions} beyond the scope; "
-            f"through the wall of branch {lung.branch_words(tube.exit.branch)}",
-        ),
-        ("needle", way + (f": {place}" if place else "")),
-        *((f"pass {number}", said) for number, said in enumerate(plan.redirections, 2)),
-        *((("ultrasound", view),) if (view := lazy.view_words(plan, lung)) else ()),
-    ]
 
 
 def arcs_table(arcs: Iterable[Sequence[float]]) -> Table:
@@ -328,19 +324,14 @@ def limits_table(appraisal: lazy.Appraisal) -> Table:
 
 def check_tables(report: lazy.CheckReport) -> list[Table]:
     """Return all findings of an independent check by stage."""
-    stages = dict.fromkeys(finding.stage for finding in report.findings)
-    return [
-        _findings_table(stage, [each for each in report.findings if each.stage == stage]) for stage in stages
-    ]
-
-
-def _findings_table(stage: str, findings: list[lazy.Finding]) -> Table:
-    made = terminal.bare_table(f"Independent check: {stage}")
-    made.add_column("")
-    made.add_column("what", no_wrap=True)
-    for heading in ("found", "limit", "margin"):
-        made.add_column(heading, justify="right")
-    made.add_column("")
-    for finding in findings:
-        made.add_row(MARKS[finding.ok], *finding.cells()[1:])
-    return made
+    tables = {}
+    for finding in report.findings:
+        if finding.stage not in tables:
+            tables[finding.stage] = made = terminal.bare_table(f"Independent check: {finding.stage}")
+            made.add_column("")
+            made.add_column("what", no_wrap=True)
+            for heading in ("found", "limit", "margin"):
+                made.add_column(heading, justify="right")
+            made.add_column("")
+        tables[finding.stage].add_row(MARKS[finding.ok], *finding.cells()[1:])
+    return list(tables.values())

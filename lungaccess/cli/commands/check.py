@@ -240,6 +240,9 @@ def _table(found: lazy.InsertionStudy, record: dict[str, Any]) -> Table:
     columns = [record["open_loop"], record["closed_loop"]]
     hits = [", ".join(f"{name} {n}" for name, n in each["hits"].items()) or "none" for each in columns]
     reached = [each["reached"] for each in columns]
+    # By how much the believed factor of the curvature differs from the true one.
+    bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
+    off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]
     rows = [
         ("reached, %", *(of_hundred(each["probability"]) for each in reached)),
         ("95 % interval", *(range_of_hundred(each["interval_95"]) for each in reached)),
@@ -247,7 +250,7 @@ def _table(found: lazy.InsertionStudy, record: dict[str, Any]) -> Table:
         ("no path left", *(f"{each['outcomes']['no path left']}" for each in columns)),
         ("tip error, median, mm", *(f"{each['tip_error_median_mm']:.2f}" for each in columns)),
         ("95 % within, mm", *(f"{each['tip_error_95_mm']:.2f}" for each in columns)),
-        ("curvature known to, median, %", "not", _known(found)),
+        ("curvature known to, median, %", "not", of_hundred(median(off)) if off else "none bends"),
         ("replans", *(f"{each['replans']}" for each in columns)),
         ("of them without a path", *(f"{each['replans_without_path']}" for each in columns)),
     ]
@@ -260,10 +263,3 @@ def _table(found: lazy.InsertionStudy, record: dict[str, Any]) -> Table:
         f"{percent(tracker.lost_share)} lost. Errors of needle and target: {found.errors.label}."
     )
     return made
-
-
-def _known(found: lazy.InsertionStudy) -> str:
-    """Return by how much the believed factor of the curvature differs from the true one, in words."""
-    bent = [run for run in found.closed_loop.insertions if run.factor > 0.0]
-    off = [abs(run.believed_factor / run.factor - 1.0) for run in bent]
-    return of_hundred(median(off)) if off else "none bends"

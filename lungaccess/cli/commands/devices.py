@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,13 +35,6 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
     names = (*ordered, *lazy.tube_preset_names(), *lazy.needle_preset_names()) if show is None else (show,)
     systems = {name: lazy.load_system(name) for name in names}
     output.tell({name: lazy.to_mapping(system) for name, system in systems.items()})
-    terminal.console.print(_preset_table(systems))
-    warned = ((name, each) for name, system in systems.items() for each in lazy.system_warnings(system))
-    terminal.show_warnings(f"{name}: {each}" for name, each in warned)
-    return ExitCode.OK
-
-
-def _preset_table(systems: Mapping[str, lazy.System]) -> Table:
     rows = [
         (
             name,
@@ -54,7 +46,11 @@ def _preset_table(systems: Mapping[str, lazy.System]) -> Table:
         for name, system in systems.items()
     ]
     headings = ("name", "scope, mm", "tubes, mm", "needle, mm", "least turning radius, mm", "what it is")
-    return terminal.table("Systems, the least invasive first (diameters)", headings, rows)
+    title = "Systems, the least invasive first (diameters)"
+    terminal.console.print(terminal.table(title, headings, rows))
+    warned = ((name, each) for name, system in systems.items() for each in lazy.system_warnings(system))
+    terminal.show_warnings(f"{name}: {each}" for name, each in warned)
+    return ExitCode.OK
 
 
 def tubes(
@@ -119,7 +115,17 @@ def _show_tables(answer: lazy.TubeAnswer, propose: bool) -> None:
         return
 
     comparison = lazy.compare_sequences(answer)
-    terminal.show([_sequence_table(comparison)])
+    rows = [
+        (
+            each.sequence.name,
+            f"{each.lateral_sweep_mm:.3f}",
+            f"{each.follow_the_leader_error_mm:.3f}",
+            f"{each.least_determinant:.3f}",
+        )
+        for each in comparison.deployed
+    ]
+    headings = ("sequence", "sweep, mm", "leader error, mm", "least determinant")
+    terminal.show([terminal.table("Sequences to the same place", headings, rows)])
     for name, why in comparison.refused.items():
         terminal.say(f"{name}: refused. {why}\n")
     if answer.system is not None:
@@ -167,20 +173,6 @@ def _numbers(values: object, digits: int) -> str:
     return ", ".join(f"{value + 0.0:.{digits}f}" for value in np.round(np.asarray(values), digits))
 
 
-def _sequence_table(comparison: lazy.SequenceComparison) -> Table:
-    rows = [
-        (
-            each.sequence.name,
-            f"{each.lateral_sweep_mm:.3f}",
-            f"{each.follow_the_leader_error_mm:.3f}",
-            f"{each.least_determinant:.3f}",
-        )
-        for each in comparison.deployed
-    ]
-    headings = ("sequence", "sweep, mm", "leader error, mm", "least determinant")
-    return terminal.table("Sequences to the same place", headings, rows)
-
-
 def _design_table(present: lazy.DesignProposal, choices: tuple[lazy.DesignProposal, ...]) -> Table:
     rows = [
         (
@@ -194,14 +186,9 @@ def _design_table(present: lazy.DesignProposal, choices: tuple[lazy.DesignPropos
         )
         for name, each in [("present", present), *(("proposal", choice) for choice in choices)]
     ]
-    headings = (
-        "design", "sweep, mm", "aside, mm", "turned, deg", "curve, mm", "1/mm", "wall, mm",
-    )  # fmt: skip
-    return terminal.table(
-        "Designs within the sweep limit, one a length of curve: tip aside and turned, outer wall",
-        headings,
-        rows,
-    )
+    headings = ("design", "sweep, mm", "aside, mm", "turned, deg", "curve, mm", "1/mm", "wall, mm")
+    title = "Designs within the sweep limit, one a length of curve: tip aside and turned, outer wall"
+    return terminal.table(title, headings, rows)
 
 
 def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
@@ -215,16 +202,12 @@ def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
         ]
         written["refused_sequences"] = comparison.refused
         if answer.system is not None:
-            written["proposals"] = [_proposal(each) for each in lazy.design_choices(answer)[1]]
+            written["proposals"] = [
+                picked(each, "lateral_sweep_mm tip_offset_mm tip_angle_rad")
+                | {name: lazy.to_mapping(getattr(each.tubes, name)) for name in ("outer", "inner")}
+                for each in lazy.design_choices(answer)[1]
+            ]
     terminal.show_json(written)
-
-
-def _proposal(proposal: lazy.DesignProposal) -> dict[str, object]:
-    return {
-        **picked(proposal, "lateral_sweep_mm tip_offset_mm tip_angle_rad"),
-        "outer": lazy.to_mapping(proposal.tubes.outer),
-        "inner": lazy.to_mapping(proposal.tubes.inner),
-    }
 
 
 def _draw(answer: lazy.TubeAnswer, out: Path) -> None:

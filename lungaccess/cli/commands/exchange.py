@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
-from rich.table import Table
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import write_text
@@ -131,16 +130,7 @@ def stream(
             session.run(seconds)
         counts = session.counts
     output.tell(asdict(counts))
-    terminal.show([_table(counts)])
-    return ExitCode.OK
-
-
-def _say(answer: lazy.Answer) -> None:
-    terminal.say(f"{answer.name}: {answer.words} ({1e3 * answer.processor_s:.1f} ms)")
-
-
-def _table(counts: lazy.LiveCounts) -> Table:
-    link = counts.link
+    link_counts = counts.link
     rows = [
         ("rounds", f"{counts.ticks}, of which {counts.overrun} took too long"),
         ("planned again", f"{counts.replans} times, {counts.found} with a way"),
@@ -149,11 +139,19 @@ def _table(counts: lazy.LiveCounts) -> Table:
             f"median {counts.replan_median_ms:.1f} ms, most {counts.replan_most_ms:.1f} ms",
         ),
         ("poses passed over for newer ones", f"{counts.superseded}"),
-        ("messages", f"{link.sent} sent, {link.received} received, {counts.unknown} of no known name"),
-        ("connections", f"{link.joined} joined, {link.left} left"),
-        *((f"dropped: {reason}", f"{count}") for reason, count in link.dropped.items()),
+        (
+            "messages",
+            f"{link_counts.sent} sent, {link_counts.received} received, {counts.unknown} of no known name",
+        ),
+        ("connections", f"{link_counts.joined} joined, {link_counts.left} left"),
+        *((f"dropped: {reason}", f"{count}") for reason, count in link_counts.dropped.items()),
     ]
-    return terminal.table("What was streamed", ("", ""), rows)
+    terminal.show([terminal.table("What was streamed", ("", ""), rows)])
+    return ExitCode.OK
+
+
+def _say(answer: lazy.Answer) -> None:
+    terminal.say(f"{answer.name}: {answer.words} ({1e3 * answer.processor_s:.1f} ms)")
 
 
 Kind = Literal[

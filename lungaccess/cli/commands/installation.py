@@ -249,8 +249,8 @@ def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
     folder = output.cache or default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
     size = sum(entry.size_bytes for entry in entries)
-    rows = [_record(entry) for entry in entries]
-    output.tell({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": rows})
+    records = [_record(entry) for entry in entries]
+    output.tell({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": records})
     if entries:
         headings = ("kind", "patient", "size", "pictures", "last used", "name")
         terminal.show([terminal.table(f"Kept in {folder}", headings, [_row(entry) for entry in entries])])
@@ -287,20 +287,21 @@ def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
 
 
 def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
-    formats = {
-        "anatomy": lazy.stored_format(),
-        "atlas": lazy.atlas_format(),
-        "resting": lazy.resting_format(),
-        "shapes": lazy.shapes_format(),
-    }
-    return lazy.cache_entries(folder, formats)
+    return lazy.cache_entries(
+        folder,
+        {
+            "anatomy": lazy.stored_format(),
+            "atlas": lazy.atlas_format(),
+            "resting": lazy.resting_format(),
+            "shapes": lazy.shapes_format(),
+        },
+    )
 
 
 def _remove(entries: Iterable[lazy.CacheEntry], output: CacheOptions) -> ExitCode:
-    gone = []
-    for entry in entries:
+    gone = list(entries)
+    for entry in gone:
         lazy.remove_entry(entry)
-        gone.append(entry)
     size = sum(entry.size_bytes for entry in gone)
     output.tell({"removed": [_record(entry) for entry in gone], "size_bytes": size})
     for each in gone:

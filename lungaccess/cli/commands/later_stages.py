@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from rich.table import Table
@@ -59,8 +58,7 @@ def replan(
     """
     if plan is not None or errors.procedure is not None:
         poses = {"scope": scope, "tubes": tube, "needle": needle}
-        return _decided(patient, poses, frame, _Followed(plan, errors, placement, radius, record), output)
-
+        return _decided(patient, poses, frame, plan, errors, placement, radius, record, output)
     Objective.of(objective)
     stated, device = target.stated(), system.load()
     pose, of_plan = _measured(scope, tube, frame)
@@ -82,45 +80,37 @@ def replan(
     return ExitCode.OK
 
 
-class _Followed(NamedTuple):
-    """What a policy follows, as it is stated."""
-
-    plan: Path | None
-    errors: options.ErrorOptions
-    placement: int
-    radius: float | None
-    record: Path | None
-
-
 def _decided(
     patient: Path,
     stated: dict[str, str | None],
     frame: options.FrameOfPose,
-    followed: _Followed,
+    carried_out: Path | None,
+    errors: options.ErrorOptions,
+    placement: int,
+    radius: float | None,
+    kept: Path | None,
     output: options.PatientOptions,
 ) -> ExitCode:
-    procedure = followed.errors.given_procedure()
-    if followed.plan is None or procedure is None:
+    procedure = errors.given_procedure()
+    if carried_out is None or procedure is None:
         raise SettingsError(
             "Only one of --plan and --procedure is given",
             expected="both: the plan that is carried out, and what is measured on the way",
             remedy="For instance --plan plan.json --procedure measured-tip",
         )
     poses = {name: [_pose(text, name, frame)[0]] for name, text in stated.items() if text is not None}
-    plan, lung = lazy.Plan.load(followed.plan), output.load(patient)
-    kept = followed.record
+    plan, lung = lazy.Plan.load(carried_out), output.load(patient)
     if kept is not None and kept.exists():
         record = lazy.ProcedureRecord.load(kept, plan, lung)
     else:
-        policy = lazy.Policy(plan, lung, followed.errors.load(), procedure, radius_mm=followed.radius)
-        record = lazy.ProcedureRecord(policy)
+        record = lazy.ProcedureRecord(lazy.Policy(plan, lung, errors.load(), procedure, radius_mm=radius))
     with progress("asking the policy"):
-        decision = record.decide(lazy.Measurements.of(**poses, placements=followed.placement))  # type: ignore[arg-type]
+        decision = record.decide(lazy.Measurements.of(**poses, placements=placement))  # type: ignore[arg-type]
     if kept is not None:
         record.save(kept)
     output.tell(decision.record())
     terminal.show(decision_tables(decision))
-    return ExitCode.OK if decision.goes_on else ExitCode.NEGATIVE
+    return ExitCode.of(decision.goes_on)
 
 
 def _measured(
@@ -148,28 +138,29 @@ def _pose(given: str, stage: str, frame: options.FrameOfPose) -> tuple[lazy.Floa
 
 
 def _replan_tables(found: lazy.RestOfPlan, *, has_map: bool) -> list[Table]:
-    tube, needle = found.tube, found.needle
-    rows = [] if tube is None else tube_rows(tube)
-    rows += [
-        (
-            "needle",
-            "none: the tip of the tubes is at the target" if needle is None else f"{needle.length_mm:.1f} mm",
-        )
-    ]
+    length = "none: the tip of the tubes is at the target"
+    if found.needle is not None:
+        length = f"{found.needle.length_mm:.1f} mm"
+    rows = [*tube_rows(found.tube), ("needle", length)]
     rows += [
         (f"least clearance of the {name}", f"{min(each.values()):.2f} mm")
         for name, each in found.clearance_mm.items()
     ]
     rows += lazy.costs_in_words(lazy.known_costs(found.costs, has_map=has_map))
-    tables = [terminal.table("the rest, proved", ("", ""), rows)]
-    if needle is not None:
-        arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in needle.arcs]
-        tables.append(arcs_table(arcs))
-    return tables
+    return _with_arcs("the rest, proved", rows, found.needle)
 
 
-def tube_rows(tube: lazy.TubeDeployment) -> list[tuple[str, str]]:
-    """Return how tubes are to be turned and inserted."""
+def _with_arcs(title: str, rows: list[tuple[str, str]], needle: lazy.NeedlePath | None) -> list[Table]:
+    """Return a table of rows, and one of the arcs of a needle if there is one."""
+    arcs = [] if needle is None else needle.arcs
+    of_arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in arcs]
+    return [terminal.table(title, ("", ""), rows), *([] if needle is None else [arcs_table(of_arcs)])]
+
+
+def tube_rows(tube: lazy.TubeDeployment | None) -> list[tuple[str, str]]:
+    """Return how tubes are to be turned and inserted; nothing where none are."""
+    if tube is None:
+        return []
     turned = tube.shape.relative_rotations_rad
     middle = [("middle tube", f"{tube.middle_insertion_mm:.1f} mm")] if tube.middle_insertion_mm else []
     return [
@@ -192,13 +183,11 @@ def decision_tables(decision: lazy.Decision) -> list[Table]:
     if decision.again:
         rows.append(("if the scope is placed again", f"{of_hundred(decision.again)} of 100"))
     if not decision.goes_on:
-        return [terminal.table(str(decision.action), ("", ""), rows)]
-    rows += [] if decision.tube is None else tube_rows(decision.tube)
-    if decision.needle is None:
-        return [terminal.table(str(decision.action), ("", ""), rows)]
-    rows.append(("needle", f"{decision.needle.length_mm:.1f} mm"))
-    arcs = [(arc.length_mm, arc.roll_rad, arc.curvature_per_mm) for arc in decision.needle.arcs]
-    return [terminal.table(str(decision.action), ("", ""), rows), arcs_table(arcs)]
+        return _with_arcs(str(decision.action), rows, None)
+    rows += tube_rows(decision.tube)
+    if decision.needle is not None:
+        rows.append(("needle", f"{decision.needle.length_mm:.1f} mm"))
+    return _with_arcs(str(decision.action), rows, decision.needle)
 
 
 def needle(
@@ -228,9 +217,7 @@ def needle(
     if out is not None:
         options.require_picture(out)
     stated, weighed = target.stated(), Objective.of(objective)
-    device = system.load()
-    lung = output.load_organ(patient)
-    limit_s = budget.time_s
+    device, lung, limit_s = system.load(), output.load_organ(patient), budget.time_s
     pose, aim = _start_pose(lung, start, frame), stated.resolve(lung)
     with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
         answer = lazy.plan_needle(

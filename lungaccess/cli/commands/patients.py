@@ -142,7 +142,10 @@ def segment(
     output.tell(made.record)
     terminal.show(_tables(made.result, made.quality))
     terminal.show_warnings(made.warnings)
-    terminal.say(_written(made.result))
+    kept = " patient.toml was edited by hand and is kept as it was." if made.result.kept_description else ""
+    terminal.say(f"Written to {out}: patient.toml, its masks, quality.json, segmentation.json.{kept}")
+    goal = "--nodule" if made.result.parts.nodule.any() else "--target ras:x,y,z"
+    terminal.say(f"Plan with: lungaccess plan {out} {goal}")
     return ExitCode.OK
 
 
@@ -173,14 +176,6 @@ def _tables(result: lazy.Segmentation, quality: lazy.Quality) -> list[Table]:
         terminal.table("Steps", ("", ""), done),
     ]
     return [each for each in made if each.row_count]
-
-
-def _written(result: lazy.Segmentation) -> str:
-    words = f"Written to {result.folder}: patient.toml, its masks, quality.json, segmentation.json."
-    if result.kept_description:
-        words += " patient.toml was edited by hand and is kept as it was."
-    goal = "--nodule" if result.parts.nodule.any() else "--target ras:x,y,z"
-    return f"{words}\nPlan with: lungaccess plan {result.folder} {goal}"
 
 
 def info(

@@ -49,20 +49,6 @@ def demo(
         terminal.show(anatomy_tables(lung)[1:3])
     guide = what_to_look_at(out)
     job = plan_search.PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
-    return _first_reachable_nodule(lung, job)
-
-
-def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> lazy.Lung:
-    """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
-
-    An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
-    """
-    # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
-    images = lazy.make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
-    return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
-
-
-def _first_reachable_nodule(lung: lazy.Lung, job: plan_search.PlanJob) -> ExitCode:
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
@@ -75,6 +61,16 @@ def _first_reachable_nodule(lung: lazy.Lung, job: plan_search.PlanJob) -> ExitCo
         remedy="Choose another --seed",
         expected="a patient with a nodule",
     )
+
+
+def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> lazy.Lung:
+    """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
+
+    An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
+    """
+    # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
+    images = lazy.make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
+    return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
 
 
 def what_to_look_at(out: Path) -> Panel:
@@ -283,8 +279,7 @@ def _show(lung: lazy.Lung, found: tuple[lazy.Alternative, ...], appraisals: list
     best = max(range(len(found)), key=lambda n: _success(appraisals[n]))
     terminal.say(f"Of these plans, plan {best + 1:02d} succeeds most often:")
     plan_search.show_headline(appraisals[best].headline)
-    has_map = lung.cost is not None
-    has_window = lung.motion is not None
+    has_map, has_window = lung.cost is not None, lung.motion is not None
     columns = [name for name in COLUMNS if (has_map or name != "map") and (has_window or name != "window")]
     rows = [
         _row(number, each, appraisal, has_map)

@@ -194,7 +194,20 @@ def certify(
     if out is not None:
         lazy.open_places_png(lung, proof, verdict, point, out)
     asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
-    output.tell(asked | lazy.made_by() | _as_json(verdict))
+    output.tell(
+        {
+            **asked,
+            **lazy.made_by(),
+            "proved_unreachable": verdict.proved,
+            **picked(verdict, "boxes share_ruled_out finished rests_on"),
+            "open_place_lps_mm": None if verdict.open_lps is None else verdict.open_lps.tolist(),
+            "open_places": [
+                picked(place, "branch generation name share narrowest")
+                | {"tip_lps_mm": place.tip_lps.tolist(), "insertions_mm": list(place.insertions_mm)}
+                for place in verdict.open_places
+            ],
+        }
+    )
     rows = [
         ("system", device.name),
         ("outcome", "proved unreachable" if verdict.proved else "not proved: it may be reachable or not"),
@@ -207,24 +220,18 @@ def certify(
         branches = len({place.branch for place in verdict.open_places})
         rows.append(("open", f"{len(verdict.open_places)} places in {branches} branches"))
         # Open places that the table names.
-        rows += [("", _words(place)) for place in verdict.open_places[:8]]
+        rows += [
+            (
+                "",
+                f"branch {place.name}, generation {place.generation}, from {lazy.point(place.tip_lps)} "
+                f"(LPS mm): {100.0 * place.share:.2g} % of the space",
+            )
+            for place in verdict.open_places[:8]
+        ]
     if out is not None:
         rows.append(("picture", str(out)))
     terminal.show([terminal.table("proof", ("", ""), rows)])
     return ExitCode.of(verdict.proved)
-
-
-def _as_json(verdict: lazy.ReachVerdict) -> dict[str, object]:
-    return {
-        "proved_unreachable": verdict.proved,
-        **picked(verdict, "boxes share_ruled_out finished rests_on"),
-        "open_place_lps_mm": None if verdict.open_lps is None else verdict.open_lps.tolist(),
-        "open_places": [
-            picked(place, "branch generation name share narrowest")
-            | {"tip_lps_mm": place.tip_lps.tolist(), "insertions_mm": list(place.insertions_mm)}
-            for place in verdict.open_places
-        ],
-    }
 
 
 def _percent(share: float) -> str:
@@ -233,10 +240,3 @@ def _percent(share: float) -> str:
         if share == 1.0 or round(100.0 * share, digits) < 100.0:
             return f"{100.0 * share:.{digits}f} %"
     return "all but a millionth of a percent"
-
-
-def _words(place: lazy.OpenPlace) -> str:
-    return (
-        f"branch {place.name}, generation {place.generation}, from {lazy.point(place.tip_lps)} (LPS mm): "
-        f"{100.0 * place.share:.2g} % of the space"
-    )

@@ -170,7 +170,7 @@ def _tolerance_table(kept: tuple[lazy.Tolerance, ...]) -> Table:
             each.unit,
             f"{each.stated:g}",
             of_hundred(each.alone.value),
-            _largest(each),
+            f"{'at least ' if each.largest >= lazy.LARGEST[each.unit] else ''}{each.largest:.2f}",
             "{:.2f}, {:.2f}".format(*each.margin),
         )
         for each in kept
@@ -180,12 +180,6 @@ def _tolerance_table(kept: tuple[lazy.Tolerance, ...]) -> Table:
         f"largest for {100.0 * kept[0].probability:g} %", "never fails within",
     )  # fmt: skip
     return terminal.table("Tolerance", headings, rows)
-
-
-def _largest(tolerance: lazy.Tolerance) -> str:
-    size = tolerance.largest
-    more = "at least " if size >= lazy.LARGEST[tolerance.unit] else ""
-    return f"{more}{size:.2f}"
 
 
 def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:

@@ -52,12 +52,10 @@ def advise(
 
 def _show_advise(advice: lazy.ScopeAdvice) -> None:
     path = advice.path
-    rows = [("insertion", f"{path.length_mm:.0f} mm"), ("retreats", f"{path.retreats}")]
-    if path.reached:
-        rows.insert(0, ("outcome", "reaches the goal in the airway"))
-    else:
-        rows.insert(0, ("outcome", f"stops {path.distance_mm:.1f} mm from the goal"))
-        rows.insert(1, ("why", advice.why_stopped))
+    rows = [("outcome", "reaches the goal in the airway")]
+    if not path.reached:
+        rows = [("outcome", f"stops {path.distance_mm:.1f} mm from the goal"), ("why", advice.why_stopped)]
+    rows += [("insertion", f"{path.length_mm:.0f} mm"), ("retreats", f"{path.retreats}")]
     inside = (
         "inside it" if path.distance_to_lesion_mm == 0.0 else f"{path.distance_to_lesion_mm:.1f} mm from it"
     )
@@ -117,10 +115,9 @@ def tour(
     stated = None if targets is None else lazy.read_lesions(targets)
     claim_folder(out, ("tour.json", "tour.png"), force=force)
     device = lazy.load_system(system)
-    lung, atlas = output.load(patient), None
+    lung = output.load(patient)
     lesions = lazy.lesions_of(lung) if stated is None else stated
-    if require_plan:
-        atlas = output.open_atlas(lung, device)
+    atlas = output.open_atlas(lung, device) if require_plan else None
     with progress("planning the tour"):
         answer = lazy.plan_tour(
             lung,
@@ -264,7 +261,12 @@ def route(
     terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
     terminal.show_warnings(opened.warnings)
     terminal.say(f"Written to {out}: route.json, route.png")
-    return _verdict(found)
+    try:
+        lazy.require_proved(found)
+    except lazy.NoRouteError as error:
+        terminal.show_error(error)
+        return ExitCode.NEGATIVE
+    return ExitCode.OK
 
 
 def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
@@ -278,12 +280,3 @@ def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
         ("ends off by", f"{found.end_error_mm:.2f} mm", f"at most {limits.end_tolerance_mm:g}"),
         ("proved on the whole curve", "yes" if found.proved else "NO", ""),
     ]  # fmt: skip
-
-
-def _verdict(found: lazy.Route) -> ExitCode:
-    try:
-        lazy.require_proved(found)
-    except lazy.NoRouteError as error:
-        terminal.show_error(error)
-        return ExitCode.NEGATIVE
-    return ExitCode.OK

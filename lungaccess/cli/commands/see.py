@@ -76,9 +76,7 @@ def report(
             lazy.bronchoscopy_webp(stored, lung, movie)
     files = [str(file) for file in (page, movie) if file is not None]
     output.tell({"files": files, "page_bytes": page.stat().st_size})
-    written = ", ".join(files)
-    size = page.stat().st_size / 1e6
-    terminal.say(f"Written: {written} (the page has {size:.1f} MB)")
+    terminal.say(f"Written: {', '.join(files)} (the page has {page.stat().st_size / 1e6:.1f} MB)")
     return ExitCode.OK
 
 

@@ -129,8 +129,7 @@ class Adviser:
         nodules, plan = self._lung.nodules, self._plan
         if nodules is None or not plan.target_origin.startswith("nodule"):
             return
-        chance = plan.chance
-        radius_mm = 5.0 if chance is None else chance.radius_mm
+        radius_mm = 5.0 if plan.chance is None else plan.chance.radius_mm
         for offset in np.concatenate([np.eye(3), -np.eye(3)]):
             # Other points of a nodule lie so far from its centre, as a share of its radius.
             point = plan.target_lps + 0.5 * radius_mm * offset
@@ -145,12 +144,11 @@ class Adviser:
     def _presets(self) -> Iterator[Advice | None]:
         plan = self._plan
         target = Target(lps_mm=plan.target_lps, origin=plan.target_origin)
+        added = f" ({plan.system.tool.name})" if plan.system.tool is not None else ""
         for system in self._systems:
             if system.name != plan.system.name:
-                words = f"device {system.name}"
-                added = f" ({plan.system.tool.name})" if plan.system.tool is not None else ""
-                name = system.name.removesuffix(added)
-                yield self._of_plan(self._planned(system, target), words, ("--system", name))
+                options = ("--system", system.name.removesuffix(added))
+                yield self._of_plan(self._planned(system, target), f"device {system.name}", options)
 
     def _of_plan(self, found: Plan | None, words: str, options: tuple[str, ...]) -> Advice | None:
         if found is None or not self._checker.check(found).accepted:

@@ -31,17 +31,12 @@ class Grade(IntEnum):
     @property
     def mark(self) -> str:
         """A character that tells the grade without its colour."""
-        return {Grade.GOOD: "✓", Grade.FAIR: "!", Grade.UNKNOWN: "?", Grade.POOR: "✗"}[self]
+        return "✓!?✗"[self]
 
     @property
     def colour(self) -> str:
         """A colour for pictures and notebooks, dark enough for white paper."""
-        return {
-            Grade.GOOD: "#00704A",
-            Grade.FAIR: "#8A5A00",
-            Grade.UNKNOWN: "#8A5A00",
-            Grade.POOR: "#B00020",
-        }[self]
+        return ("#00704A", "#8A5A00", "#8A5A00", "#B00020")[self]
 
     @property
     def key(self) -> str:
@@ -171,11 +166,7 @@ class Headline:
         """The grade in words."""
         if self.geometry == Geometry.REFUSED:
             return "refused: do not use"
-        if self.grade == Grade.UNKNOWN:
-            return "not known to succeed"
-        return {Grade.GOOD: "likely to succeed", Grade.FAIR: "may fail", Grade.POOR: "likely to fail"}[
-            self.grade
-        ]
+        return ("likely to succeed", "may fail", "not known to succeed", "likely to fail")[self.grade]
 
     @property
     def all_failures(self) -> dict[str, Share]:

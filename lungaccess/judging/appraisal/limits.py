@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from typing import Any
 
 from anatomy.base.records import frozen_value
 from lungaccess.judging.checking import Finding
@@ -34,51 +35,39 @@ class _Kind:
     digits: int = 2
 
 
-def _distance(what: str, *findings: str) -> _Kind:
-    return _Kind(what=what, findings=findings)
+def _kind(what: str, *findings: str, **shown: Any) -> _Kind:
+    return _Kind(what=what, findings=findings, **shown)
 
 
-def _angle(what: str, *findings: str) -> _Kind:
-    return _Kind(what=what, findings=findings, unit="°", scale=math.degrees(1.0), digits=1)
-
-
-def _radius(what: str, finding: str) -> _Kind:
-    return _Kind(what=what, findings=(finding,), inverse=True, digits=1)
-
-
-def _length(what: str, *findings: str) -> _Kind:
-    return _Kind(what=what, findings=findings, digits=1)
-
+ANGLE: dict[str, Any] = {"unit": "°", "scale": math.degrees(1.0), "digits": 1}
+STRAIN: dict[str, Any] = {"unit": "%", "scale": 100.0}
+RADIUS: dict[str, Any] = {"inverse": True, "digits": 1}
+"""Numbers of these kinds are shown so."""
 
 KINDS = (
-    _distance("scope to lumen wall", "scope.fits"),
-    _distance("tubes to vessel", "tube.clearance.vessel"),
-    _distance("tubes to pleura", "tube.clearance.outside"),
-    _distance("tubes to fissure", "tube.clearance.fissure"),
-    _distance("tubes to other airway", "tube.clearance.airway"),
-    _Kind(
-        what="tube bend (strain)",
-        findings=("tube.strain", "tube.strain.outer", "tube.strain.inner"),
-        unit="%",
-        scale=100.0,
-    ),
-    _Kind(what="needle bend in scope (strain)", findings=("needle.strain",), unit="%", scale=100.0),
-    _radius("scope radius of curvature", "tube.channel"),
-    _angle("bend set at the scope's handle", "scope.handle"),
-    _distance("sideways sweep of tubes", "tube.sweep.limit", "tube.sweep.stated_limit"),
-    _angle("tubes to wall at exit", "tube.exit.angle.limit", "tube.exit.angle.stated_limit"),
-    _distance("tubes in the wall", "tube.wall_run.limit", "tube.wall_run.stated_limit"),
-    _length("extension beyond scope", "tube.extension"),
-    _length("inner beyond outer tube", "tube.protrusion"),
-    _distance("needle to vessel", "needle.clearance.vessel"),
-    _distance("needle to pleura", "needle.clearance.outside"),
-    _distance("needle to fissure", "needle.clearance.fissure"),
-    _distance("needle to airway", "needle.clearance.airway", "needle.clearance.other_airway"),
-    _distance("needle to lumen at exit", "needle.clearance.lumen"),
-    _radius("needle radius of curvature", "needle.curvature"),
-    _length("needle length", "needle.length.limit"),
-    _angle("needle angle from start", "needle.angle.limit"),
-    _angle("needle turning in all", "needle.turn.limit"),
+    _kind("scope to lumen wall", "scope.fits"),
+    _kind("tubes to vessel", "tube.clearance.vessel"),
+    _kind("tubes to pleura", "tube.clearance.outside"),
+    _kind("tubes to fissure", "tube.clearance.fissure"),
+    _kind("tubes to other airway", "tube.clearance.airway"),
+    _kind("tube bend (strain)", "tube.strain", "tube.strain.outer", "tube.strain.inner", **STRAIN),
+    _kind("needle bend in scope (strain)", "needle.strain", **STRAIN),
+    _kind("scope radius of curvature", "tube.channel", **RADIUS),
+    _kind("bend set at the scope's handle", "scope.handle", **ANGLE),
+    _kind("sideways sweep of tubes", "tube.sweep.limit", "tube.sweep.stated_limit"),
+    _kind("tubes to wall at exit", "tube.exit.angle.limit", "tube.exit.angle.stated_limit", **ANGLE),
+    _kind("tubes in the wall", "tube.wall_run.limit", "tube.wall_run.stated_limit"),
+    _kind("extension beyond scope", "tube.extension", digits=1),
+    _kind("inner beyond outer tube", "tube.protrusion", digits=1),
+    _kind("needle to vessel", "needle.clearance.vessel"),
+    _kind("needle to pleura", "needle.clearance.outside"),
+    _kind("needle to fissure", "needle.clearance.fissure"),
+    _kind("needle to airway", "needle.clearance.airway", "needle.clearance.other_airway"),
+    _kind("needle to lumen at exit", "needle.clearance.lumen"),
+    _kind("needle radius of curvature", "needle.curvature", **RADIUS),
+    _kind("needle length", "needle.length.limit", digits=1),
+    _kind("needle angle from start", "needle.angle.limit", **ANGLE),
+    _kind("needle turning in all", "needle.turn.limit", **ANGLE),
 )
 """Everything that a device or a margin limits; other findings compare statements of the plan."""
 

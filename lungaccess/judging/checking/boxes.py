@@ -166,7 +166,7 @@ class Tiles:
         return [
             cluster
             for tile in self._tiles_between(low, high)
-            for key in _keys(select)
+            for key in ([NOT_LUMEN] if select.complement else [bit for bit in BITS if select.bits & bit])
             for cluster in self._clusters(key, tile)
             if cluster.branch not in select.but
             and ((cluster.low_mm <= high) & (cluster.high_mm >= low)).all(axis=1).any()
@@ -204,13 +204,6 @@ class Tiles:
                 half_mm=0.5 * self.spacing_mm,
                 branch=int(name) - 2 if key == structures.AIRWAY else -1,
             )
-
-
-def _keys(select: Select) -> list[int]:
-    """Return the parts that make up a structure."""
-    if select.complement:
-        return [NOT_LUMEN]
-    return [bit for bit in BITS if select.bits & bit]
 
 
 def _bodies(key: int, labels: Labels) -> Labels:
@@ -255,7 +248,9 @@ class Boxes:
         local = self._tiles.local_mm(points)
         out = np.where(self.holds(points), 0.0, self._reach_mm)
         clusters = self._tiles.near(self._select, local, self._reach_mm)
-        bounds = [_to_bounding_box(cluster, local) for cluster in clusters]
+        # Distances to the bounding boxes of the clusters.
+        gaps = (np.maximum(np.maximum(c.low_mm - local, local - c.high_mm), 0.0) for c in clusters)
+        bounds = [np.sqrt((gap**2).sum(axis=1)) for gap in gaps]
         for n in sorted(range(len(clusters)), key=lambda each: float(bounds[each].min())):
             left = np.flatnonzero(bounds[n] < out)
             if len(left):
@@ -356,12 +351,6 @@ class PathDistances:
         inside = self._boxes.holds(points)
         out[inside[:-1] | inside[1:]] = 0.0
         return out
-
-
-def _to_bounding_box(cluster: Cluster, local: Float) -> Float:
-    """Return the distances from points to the bounding box of a cluster."""
-    gap = np.maximum(np.maximum(cluster.low_mm - local, local - cluster.high_mm), 0.0)
-    return np.asarray(np.sqrt((gap**2).sum(axis=1)))
 
 
 class Environment:

@@ -102,9 +102,7 @@ def check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
     tubes = shapes.integrate(plan.scope.lps_from_scope_tip, shapes.tube_pieces(plan))
     points = [shapes.beyond(tubes, plan.tube.exit.arc_length_mm).points]
     if plan.needle is not None:
-        points.append(
-            shapes.integrate(plan.needle.lps_from_start, shapes.needle_pieces(plan.needle.arcs)).points
-        )
+        points.append(shapes.integrate(plan.needle.lps_from_start, plan.needle.arcs).points)
     chance = lung.fissure_chance(np.concatenate(points))
     if chance is None:
         found.true(f"{name}.known", most is None, FISSURES_UNKNOWN_HERE)

@@ -80,8 +80,9 @@ def completed_plan(
         follow_the_leader_error_mm=motions.follow_the_leader_error_mm,
         shape=motions.shape,
     )
-    pieces = shapes.cut_at(shapes.needle_pieces(motions.arcs), needle.exit_exemption_mm)
+    pieces = shapes.cut_at(motions.arcs, needle.exit_exemption_mm)
     curve = shapes.integrate(motions.lps_from_tube_tip, pieces)
+    turned, angle = turning(curve)
     draft = Plan(
         software_version=software_version(),
         patient_name=lung.name,
@@ -96,7 +97,14 @@ def completed_plan(
         objective=OBJECTIVE,
         scope=_scope(motions, environment, system),
         tube=tube,
-        needle=_needle(motions, curve),
+        needle=parts.NeedlePath(
+            lps_from_start=motions.lps_from_tube_tip,
+            arcs=motions.arcs,
+            end_lps=curve.points[-1],
+            length_mm=float(sum(arc.length_mm for arc in motions.arcs)),
+            max_angle_from_start_rad=angle,
+            accumulated_turn_rad=turned,
+        ),
         exemption=parts.Exemption(
             branch=0, exit_point_lps=np.zeros(3), needle_length_mm=needle.exit_exemption_mm
         ),
@@ -155,18 +163,5 @@ def _with_exit(plan: Plan, environment: Environment) -> Plan:
         wall_angle_rad=max(angle, min(least, angle + wall_exit.WALL_ANGLE_TOLERANCE_RAD)),
         wall_run_mm=run,
     )
-    whole = replace(tube, exit=stated)
     exemption = replace(plan.exemption, branch=way_out.branch, exit_point_lps=point)
-    return replace(plan, tube=whole, exemption=exemption)
-
-
-def _needle(motions: Motions, curve: shapes.Curve) -> parts.NeedlePath:
-    turned, angle = turning(curve)
-    return parts.NeedlePath(
-        lps_from_start=motions.lps_from_tube_tip,
-        arcs=motions.arcs,
-        end_lps=curve.points[-1],
-        length_mm=float(sum(arc.length_mm for arc in motions.arcs)),
-        max_angle_from_start_rad=angle,
-        accumulated_turn_rad=turned,
-    )
+    return replace(plan, tube=replace(tube, exit=stated), exemption=exemption)

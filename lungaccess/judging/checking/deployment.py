@@ -42,7 +42,6 @@ from stages.needle.device import Needle
 from stages.tube.device import AIRWAY_MM, Tube
 
 if TYPE_CHECKING:
-    from anatomy.lung import Lung
     from stages.tube.casadi_shape import DerivedShape
 
 STEP_MM = 0.5
@@ -223,12 +222,6 @@ def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, f
     check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
 
 
-def _first_contact(lung: "Lung", curve: Curve, way_out: Exit, plan: Plan) -> int:
-    """Return the frame from which on, up to the exit, the tube's rim is never wholly in the lumen."""
-    radius = shapes.radius_at(plan, curve.arc_mm[: way_out.frame + 1])
-    return last_wet(labels_at(lung, rim(curve.frames[: way_out.frame + 1], radius)))
-
-
 def rim(frames: Float, radius_mm: Float) -> Float:
     """Return `RIM_POINTS` points around the axis at each of S frames, `(S RIM_POINTS, 3)`."""
     phi = np.linspace(0.0, 2.0 * np.pi, RIM_POINTS, endpoint=False)
@@ -250,7 +243,10 @@ def _check_clearance(
 
     More are the sweep, and how far the derived shape is from the curve.
     """
-    contact = _first_contact(environment.lung, curve, way_out, plan)
+    # From this frame on, up to the exit, the tube's rim is never wholly in the lumen.
+    before = curve.frames[: way_out.frame + 1]
+    around = rim(before, shapes.radius_at(plan, curve.arc_mm[: way_out.frame + 1]))
+    contact = last_wet(labels_at(environment.lung, around))
     margin = plan.system.margins.total_mm + beside_mm
     needed = shapes.radius_at(plan, curve.arc_mm[:-1] + ROUNDING_MM) + margin + curve.sagitta_mm
     # In the lumen, up to the exit, other branches are only open space.
@@ -328,11 +324,15 @@ def _check_arcs(plan: Plan, curve: Curve, derived: "DerivedShape", found: Findin
     return off
 
 
-def _replay(plan: Plan, derived: "DerivedShape", found: Findings) -> float:
-    """Compare every step of the way with the final place; return how far the tubes get from it.
+SWEEP_TOLERANCE_MM = 0.02
+"""A replay at steps may find so much less than a planner, which takes the largest sweep."""
 
-    Tubes that bend in one plane state how far they get from the final shape, all others how far each place
-    gets from where it ends, which is not less.
+
+def _replay(plan: Plan, derived: "DerivedShape", found: Findings) -> float:
+    """Compare every step of the way with the final place; return the sweep, mm, that clearance allows for.
+
+    The sweep is the farthest that any place gets from the final shape, of tubes that bend in one plane, or,
+    of all others, from where it ends, which is not less; `leader` is the first of these for all tubes.
     """
     final, sweep, leader = derived.points_mm, 0.0, 0.0
     for body in derived.way:
@@ -344,7 +344,15 @@ def _replay(plan: Plan, derived: "DerivedShape", found: Findings) -> float:
         if not plan.system.tubes.planar:
             off = np.linalg.norm(points - derived.at(arc), axis=1)
         sweep = max(sweep, float(off.max()))
-    return check_sweep(plan, sweep, leader, len(derived.way), found)
+    tube, limit = plan.tube, plan.system.tubes.max_lateral_sweep_mm
+    detail = f"sideways motion while the tubes are deployed, {len(derived.way)} steps replayed"
+    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
+    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", "sideways motion as stated")
+    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
+    for value, recomputed, name in stated:
+        detail = "not less than recomputed"
+        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
+    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
 
 
 def _check_strain(plan: Plan, derived: "DerivedShape", found: Findings) -> None:
@@ -401,30 +409,5 @@ def _stiffness(tube: Tube, from_tip_mm: float) -> float:
 
 def _strained_mm(tube: Tube) -> float:
     """Return the strain of a tube for each 1/mm of change of curvature, mm, at worst along it."""
-    return (
-        0.5
-        * tube.outer_diameter_mm
-        * max((each.strain_factor for each in tube.slotted_segments), default=1.0)
-    )
-
-
-SWEEP_TOLERANCE_MM = 0.02
-"""A replay at steps may find so much less than a planner, which takes the largest sweep."""
-
-
-def check_sweep(plan: Plan, sweep: float, leader: float, steps: int, found: Findings) -> float:
-    """Record sweep and error at the tip of a replay; return the sweep, mm, that clearance allows for.
-
-    The sweep is the farthest that any place of the tubes gets from their final shape, `leader` the farthest
-    that their tip does.
-    """
-    tube, limit = plan.tube, plan.system.tubes.max_lateral_sweep_mm
-    detail = f"sideways motion while the tubes are deployed, {steps} steps replayed"
-    found.at_most("tube.sweep.limit", sweep, limit, "mm", detail, SWEEP_TOLERANCE_MM)
-    detail = "sideways motion as stated"
-    found.at_most("tube.sweep.stated_limit", tube.lateral_sweep_mm, limit, "mm", detail)
-    stated = ((tube.lateral_sweep_mm, sweep, "sweep"), (tube.follow_the_leader_error_mm, leader, "leader"))
-    for value, recomputed, name in stated:
-        detail = "not less than recomputed"
-        found.at_least(f"tube.{name}.stated", value, recomputed, "mm", detail, SWEEP_TOLERANCE_MM)
-    return max(sweep if sweep > SWEEP_TOLERANCE_MM else 0.0, tube.lateral_sweep_mm)
+    factor = max((each.strain_factor for each in tube.slotted_segments), default=1.0)
+    return 0.5 * tube.outer_diameter_mm * factor

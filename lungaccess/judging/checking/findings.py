@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from html import escape
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -148,15 +148,15 @@ class Findings:
         self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
     ) -> bool:
         """Record a value that must not be below `limit` by more than `tolerance`."""
-        kept = value >= limit - tolerance
-        return self._bounded("at least", kept, name, value, limit, unit, detail, tolerance)
+        said = {"unit": unit, "detail": detail, "tolerance": tolerance}
+        return self._bounded(name, value >= limit - tolerance, value, limit, "at least", **said)
 
     def at_most(
         self, name: str, value: float, limit: float, unit: str, detail: str = "", tolerance: float = 0.0
     ) -> bool:
         """Record a value that must not be above `limit` by more than `tolerance`."""
-        kept = value <= limit + tolerance
-        return self._bounded("at most", kept, name, value, limit, unit, detail, tolerance)
+        said = {"unit": unit, "detail": detail, "tolerance": tolerance}
+        return self._bounded(name, value <= limit + tolerance, value, limit, "at most", **said)
 
     def agrees(self, name: str, stated: ArrayLike, found: ArrayLike, largest: float, unit: str) -> bool:
         """Record the largest difference between a stated and a recomputed value (or array)."""
@@ -165,21 +165,8 @@ class Findings:
         detail = f"stated {float(a):.6g}, recomputed {float(b):.6g}" if a.shape == b.shape == () else ""
         return self.at_most(name, gap, largest, unit, detail or "largest difference of stated and recomputed")
 
-    def _bounded(
-        self,
-        side: Side,
-        ok: bool,
-        name: str,
-        value: float,
-        limit: float,
-        unit: str,
-        detail: str,
-        spare: float,
-    ) -> bool:
-        made = Finding(
-            name=name, ok=bool(ok), value=float(value), limit=float(limit), side=side, tolerance=spare,
-            unit=unit, detail=detail,
-        )  # fmt: skip
+    def _bounded(self, name: str, ok: bool, value: float, limit: float, side: Side, **said: Any) -> bool:
+        made = Finding(name=name, ok=bool(ok), value=float(value), limit=float(limit), side=side, **said)
         self._all.append(made)
         return bool(ok)
 
@@ -191,11 +178,8 @@ class Findings:
 
 def _table(rows: Sequence[Row]) -> str:
     head = "".join(f"<th>{heading}</th>" for heading in _HEADINGS)
-    return f"<table><tr>{head}</tr>{''.join(_row(row) for row in rows)}</table>"
-
-
-def _row(row: Row) -> str:
-    return "<tr>" + "".join(f'<td style="text-align:left">{escape(cell)}</td>' for cell in row) + "</tr>"
+    cells = ("".join(f'<td style="text-align:left">{escape(cell)}</td>' for cell in row) for row in rows)
+    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
 POSITION_TOLERANCE_MM = 1e-3

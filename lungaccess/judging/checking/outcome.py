@@ -21,9 +21,7 @@ from lungaccess.judging.checking.findings import (
     angle_between,
 )
 from lungaccess.judging.checking.shapes import Curve, beyond, cut_at, integrate, radius_at, tube_pieces, up_to
-from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
-from stages.tube.device import Tube
 
 if TYPE_CHECKING:
     from anatomy.lung import Lung
@@ -334,43 +332,24 @@ def check_needle_load(plan: Plan, found: Findings) -> None:
     theirs together, and it must not move them any more while it is inserted.  What any other needle does is
     counted by no plan, is not checked here, and is said.
     """
-    shaft, needle = plan.system.needle_tube, plan.needle
+    tube, tubes, shaft, needle = plan.tube, plan.system.tubes, plan.system.needle_tube, plan.needle
     if needle is None or shaft is None:
         return
+    from stages.tube.casadi_shape import derive_arrival, derive_inserted
+
+    deployed = tubes.nested, shaft, tube.rotations_rad(tubes)[::-1], tube.insertions_mm(tubes)[::-1]
     try:
         if plan.system.needle_preloaded:
-            _check_inserted(plan, needle, shaft, found)
-        else:
-            _say_neglected(plan, shaft, found)
+            loaded = derive_inserted(*deployed, needle.length_mm)
+            stated = np.linalg.solve(plan.scope.lps_from_scope_tip, tube.lps_from_tip)
+            off_mm = float(np.linalg.norm(loaded[:3, 3] - stated[:3, 3]))
+            detail = "from the stated tip of the tubes to that under the load of the inserted needle"
+            found.at_most(NEEDLE_LOAD, off_mm, 0.0, "mm", detail, STILL_MM)
+            return
+        before, arrived = derive_arrival(*deployed)
     except LungaccessError as error:
         found.unchecked(NEEDLE_LOAD, f"no shape was found with the needle in the tubes: {error}")
-
-
-def _check_inserted(plan: Plan, needle: NeedlePath, shaft: Tube, found: Findings) -> None:
-    """The tip is where it is stated when the needle is inserted, too."""
-    from stages.tube.casadi_shape import derive_inserted
-
-    tube, tubes = plan.tube, plan.system.tubes
-    loaded = derive_inserted(
-        tubes.nested,
-        shaft,
-        tube.rotations_rad(tubes)[::-1],
-        tube.insertions_mm(tubes)[::-1],
-        needle.length_mm,
-    )
-    stated = np.linalg.solve(plan.scope.lps_from_scope_tip, tube.lps_from_tip)
-    off_mm = float(np.linalg.norm(loaded[:3, 3] - stated[:3, 3]))
-    detail = "from the stated tip of the tubes to that under the load of the inserted needle"
-    found.at_most(NEEDLE_LOAD, off_mm, 0.0, "mm", detail, STILL_MM)
-
-
-def _say_neglected(plan: Plan, shaft: Tube, found: Findings) -> None:
-    from stages.tube.casadi_shape import derive_arrival
-
-    tubes = plan.system.tubes
-    before, arrived = derive_arrival(
-        tubes.nested, shaft, plan.tube.rotations_rad(tubes)[::-1], plan.tube.insertions_mm(tubes)[::-1]
-    )
+        return
     shift_mm = float(np.linalg.norm(arrived[:3, 3] - before[:3, 3]))
     turn_rad = float(angle_between(arrived[:3, 2], before[:3, 2]))
     detail = (

@@ -85,7 +85,6 @@ def _sizes(value: object, where: str) -> Iterator[tuple[str, float]]:
 
 
 def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
-    stated = to_mapping(plan.system)
     found.true(
         "system.fingerprint", plan.system_fingerprint == system_fingerprint(plan.system), plan.system.name
     )
@@ -101,7 +100,8 @@ def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
             "system.margins", "all margins are 0: the plan keeps clear of the masks, not of what they miss"
         )
     if system is not None:
-        found.true("system.given", stated == to_mapping(system), "settings of the system that was asked for")
+        same = to_mapping(plan.system) == to_mapping(system)
+        found.true("system.given", same, "settings of the system that was asked for")
 
 
 def _check_required(plan: Plan, found: Findings) -> None:

@@ -223,13 +223,10 @@ def _check_fit(
     boxes = environment.boxes(not_lumen, max(needed, stated) + 1.0)
     gap = least_gap_mm(motion, boxes, needed - POSITION_TOLERANCE_MM, stated - MARGIN_TOLERANCE_MM)
     found.at_least(
-        "scope.fits",
-        gap,
-        needed,
-        "mm",
+        "scope.fits", gap, needed, "mm",
         "smallest lumen radius, in all states and between them; needed: radius of the scope plus its margin",
         POSITION_TOLERANCE_MM,
-    )
+    )  # fmt: skip
     found.at_most(
         "scope.margin", stated - gap, 0.0, "mm", "stated beyond recomputed margin", MARGIN_TOLERANCE_MM
     )

@@ -1,6 +1,6 @@
 """Own kinematics of the check: poses re-integrated with matrix exponentials, shapes by quadrature."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,17 +15,10 @@ TINY_MM = 1e-9
 TERMS = 14
 """Of the exponential series for a matrix of norm 1/4: the next term is less than 1e-20."""
 
+Piece = NeedleArc
+"""A stretch of constant curvature of tubes or needle, which turns about its tangent, then advances."""
 STEP_MM = 0.05
 """Largest integration step; the sagitta of one step at a curvature of 0.025 / mm is 8e-6 mm."""
-
-
-@frozen_record
-class Piece:
-    """A piece of constant curvature: turn about the tangent, then advance."""
-
-    length_mm: float
-    roll_rad: float
-    curvature_per_mm: float
 
 
 @frozen_record
@@ -148,13 +141,6 @@ def tube_pieces(plan: Plan) -> list[Piece]:
             pieces.append(Piece(length_mm=length, roll_rad=direction - turned, curvature_per_mm=curvature))
             turned = direction
     return pieces
-
-
-def needle_pieces(arcs: Iterable[NeedleArc]) -> list[Piece]:
-    """Return the arcs of a needle as pieces."""
-    return [
-        Piece(length_mm=a.length_mm, roll_rad=a.roll_rad, curvature_per_mm=a.curvature_per_mm) for a in arcs
-    ]
 
 
 def tube_tip(plan: Plan, curve: Curve) -> Float:

@@ -30,7 +30,7 @@ from lungaccess.judging.checking.findings import (
     check_same_pose,
 )
 from lungaccess.judging.checking.outcome import check_costs, check_target, check_tool, forbidden_bits
-from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate, needle_pieces
+from lungaccess.judging.checking.shapes import TINY_MM, Curve, Piece, cut_at, integrate
 from lungaccess.plans.parts import NeedlePath
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
@@ -58,14 +58,13 @@ def check_needle(
     check_same_pose("needle.start", needle.lps_from_start, plan.tube.lps_from_tip, found)
     if tube_end is not None:
         check_same_pose("needle.start.integrated", needle.lps_from_start, tube_end, found)
-    pieces = needle_pieces(needle.arcs)
-    curve = integrate(needle.lps_from_start, cut_at(pieces, plan.exemption.needle_length_mm))
+    curve = integrate(needle.lps_from_start, cut_at(needle.arcs, plan.exemption.needle_length_mm))
     length = float(sum(arc.length_mm for arc in needle.arcs))
     found.agrees("needle.length", needle.length_mm, length, LENGTH_TOLERANCE_MM, "mm")
     turned, angle = turning(curve)
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
-    if not check_limits(pieces, device, curve, found):
+    if not check_limits(needle.arcs, device, curve, found):
         return
     found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
     check_target(plan, lung, curve.points[-1], found)
@@ -155,9 +154,11 @@ def _check_clear(
     """Record whether a needle, as capsules padded by the sagitta, keeps its distances; return the least."""
     nearest: dict[str, float] = {}
     for name, select, where, needed in structures_known(cases, "needle", environment.lung, found):
-        first, last = run_of_frames(where)
-        if last - first < 1:
+        frames = np.flatnonzero(where)
+        if not len(frames) or frames[0] == len(where) - 1:
             continue
+        # An exempt run reaches the next frame.
+        first, last = int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
         nearest[name] = check_clear(
             f"needle.clearance.{name}",
             environment.boxes(select, REACH_MM),
@@ -167,14 +168,6 @@ def _check_clear(
             limited=name != "fissure" or fissures,
         )
     return nearest
-
-
-def run_of_frames(where: np.ndarray) -> tuple[int, int]:
-    """Return first and last frame of a run of True frames; an exempt run reaches the next frame."""
-    frames = np.flatnonzero(where)
-    if not len(frames):
-        return 0, 0
-    return int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
 
 
 WALL_ZONE_MM = 1.0

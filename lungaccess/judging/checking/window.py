@@ -104,14 +104,12 @@ def check_window(plan: Plan, environment: Environment, found: Findings) -> None:
     window, motion = plan.window, environment.lung.motion
     if plan.aim is not None and plan.system.tool is None:
         _check_aim(plan, found)
-    if window is None and motion is None:
-        return
     if window is None or motion is None:
-        what = "a window, but no motion of the patient is known" if window else "no window of breathing"
         if window is not None:
-            found.true("window.motion", False, f"the plan states {what}")
-        else:
-            found.unchecked("window", f"the plan states {what}")
+            detail = "the plan states a window, but no motion of the patient is known"
+            found.true("window.motion", False, detail)
+        elif motion is not None:
+            found.unchecked("window", "the plan states no window of breathing")
         return
     found.true("window.motion", window.motion_key == motion.key, "the motion is that of the patient")
     beside = float(np.linalg.norm(np.asarray(plan.end_lps) - np.asarray(plan.goal_lps)))
@@ -149,7 +147,7 @@ class _Devices:
         self.tube: Curve = integrate(plan.scope.lps_from_scope_tip, pieces)
         self.needle: Curve | None = None
         if plan.needle is not None:
-            cut = cut_at(shapes.needle_pieces(plan.needle.arcs), plan.exemption.needle_length_mm)
+            cut = cut_at(plan.needle.arcs, plan.exemption.needle_length_mm)
             self.needle = integrate(plan.needle.lps_from_start, cut)
 
     @property
@@ -236,7 +234,9 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
         return
     # Phases at which the distance to the target is looked at, which costs nothing.
     phases = np.concatenate([np.linspace(a, b, 200) for a, b in window.phases])
-    most = max(_miss(plan, breath, devices, float(phase)) for phase in phases)
+    end, goal = devices.end[None], np.asarray(plan.goal_lps)[None]
+    misses = (breath.carried(end, float(phase)) - breath.moved(goal, float(phase)) for phase in phases)
+    most = max(float(np.linalg.norm(miss)) for miss in misses)
     detail = f"end of the devices to the moving target, at {len(phases)} phases of the window"
     most += window.hysteresis * (float(devices.from_tip_mm(devices.end)) + most)
     found.at_most("window.target", most, window.tolerance_mm, "mm", detail, ROUNDING)
@@ -247,11 +247,6 @@ def _check_target(plan: Plan, breath: Breath, devices: _Devices, found: Findings
     most += window.hysteresis * (float(devices.from_tip_mm(hole[0])) + most)
     # The point of the exit is known to this.
     found.at_most("window.hole", most, devices.hole_mm, "mm", detail, 0.02)
-
-
-def _miss(plan: Plan, breath: Breath, devices: _Devices, phase: float) -> float:
-    end = breath.carried(devices.end[None], phase)
-    return float(np.linalg.norm(end - breath.moved(np.asarray(plan.goal_lps)[None], phase)))
 
 
 def _check_clear(

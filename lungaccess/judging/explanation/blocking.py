@@ -139,16 +139,9 @@ def look_along(arcs: DirectArcs) -> tuple[tuple[Blocking, ...], BlockedArc | Non
     entries, environment = arcs.atlas.deployments, arcs.evaluator.environment
     found, labels = np.zeros((len(chosen), kernels.N_COLUMNS)), np.zeros((len(chosen), 2), dtype=np.int64)
     x, y, z = arcs.task.target.lps_mm.tolist()
-    kernels.look_along_arcs(
-        environment.obstacles,
-        environment.limits,
-        np.ascontiguousarray(entries.positions[chosen]),
-        np.ascontiguousarray(entries.tangents[chosen]),
-        np.ascontiguousarray(entries.branch[chosen]),
-        (x, y, z),
-        found,
-        labels,
-    )
+    starts = (entries.positions, entries.tangents, entries.branch)
+    poses = (np.ascontiguousarray(each[chosen]) for each in starts)
+    kernels.look_along_arcs(environment.obstacles, environment.limits, *poses, (x, y, z), found, labels)
     blocked = np.flatnonzero(found[:, kernels.SHORTFALL] > 0.0)
     if not len(blocked):
         return (), None
@@ -188,16 +181,11 @@ def arc_beyond_limits(arcs: DirectArcs) -> ArcBeyondLimits | None:
     most_turn = _most_turn(needle)
     shares = (curvature / needle.max_curvature_per_mm, length / needle.max_length_mm, turn / most_turn)
     excess = np.sum([np.maximum(share - 1.0, 0.0) for share in shares], axis=0)
-    needles = [each.needle for each in presets_by_invasiveness() if each.needle is not None]
-    possible = np.any(
-        [
-            (curvature <= each.max_curvature_per_mm)
-            & (length <= each.max_length_mm)
-            & (turn <= _most_turn(each))
-            for each in [needle, *needles]
-        ],
-        axis=0,
-    )
+    possible = np.zeros(len(chord), dtype=bool)
+    for each in (needle, *(system.needle for system in presets_by_invasiveness())):
+        if each is not None:
+            short = (length <= each.max_length_mm) & (turn <= _most_turn(each))
+            possible |= (curvature <= each.max_curvature_per_mm) & short
     best = int(np.argmin(np.where(possible, excess, np.inf)))
     if excess.min() <= 0.0 or not possible[best]:
         return None
@@ -302,7 +290,9 @@ def map_starts(arcs: DirectArcs) -> StartMap:
     entries, names = arcs.atlas.deployments, list(FAILS)
     why = np.full(entries.count, names.index(OUT_OF_REACH), dtype=np.int64)
     labels, of_arc = np.unique(arcs.blockers(arcs.in_workspace)[0], return_inverse=True)
-    codes = np.array([names.index(_reason(int(label))) for label in labels], dtype=np.int64)
+    reasons = {"nothing": CLEAR, "the needle's limits": LIMITS}
+    blockers = [blocker_name(int(label)) for label in labels]
+    codes = np.array([names.index(reasons.get(name, name)) for name in blockers], dtype=np.int64)
     why[arcs.in_workspace] = codes[of_arc.ravel()] if len(labels) else why[arcs.in_workspace]
     counted = np.bincount(why, minlength=len(names))
     # Starts in one cube of this side are shown as one: about the distance at which two dots are still two.
@@ -323,8 +313,3 @@ def map_starts(arcs: DirectArcs) -> StartMap:
         why=best,
         counts=MappingProxyType({FAILS[name]: int(n) for name, n in zip(names, counted, strict=True)}),
     )
-
-
-def _reason(label: int) -> str:
-    name = blocker_name(label)
-    return {"nothing": CLEAR, "the needle's limits": LIMITS}.get(name, name)

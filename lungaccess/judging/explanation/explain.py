@@ -24,14 +24,13 @@ from lungaccess.planning import coupled
 from lungaccess.planning.one_system import run
 from lungaccess.planning.reachability import ReachVerdict, UnreachableProof
 from lungaccess.plans.no_plan import NoPlan
-from lungaccess.plans.plan import Plan
 from lungaccess.plans.view import best_view_words
 from lungaccess.problem.preset_order import least_invasive_first, presets_by_invasiveness
 from lungaccess.problem.request import Limits, Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task, objective_of
-from lungaccess.uncertainty.risk import Share, assess
+from lungaccess.uncertainty.risk import assess
 from stages.needle import DEFAULT, Objective, needle_environment
 
 DEFAULT_TIME_S = 10.0
@@ -116,6 +115,7 @@ class Explainer:
         known = {own.name, *failure.attempts}
         untried = [each for each in others if each.name not in known]
         tried: list[Attempt] = []
+        task, found = self._task, self._found
         self._part_of_needle("what blocks the direct arcs", self._what_blocks)
         self._part_of_needle("map of the starts", self._starts)
         if self._task.with_fissures:
@@ -134,25 +134,25 @@ class Explainer:
         self._part_of_needle("proof that the target is unreachable", self._proof)
         done = {attempt.system.name for attempt in tried}
         order = {each.name: n for n, each in enumerate(least_invasive_first([a.system for a in tried]))}
-        changes = self._found.pop("changes", [])
+        changes = found.pop("changes", [])
         made = Explanation(
-            patient_name=self._task.lung.name,
-            system=self._task.system,
-            target=self._task.target,
-            with_fissures=self._task.with_fissures,
+            patient_name=task.lung.name,
+            system=task.system,
+            target=task.target,
+            with_fissures=task.with_fissures,
             failure=failure,
             attempts=tuple(sorted(tried, key=lambda attempt: order[attempt.system.name])),
             untried=tuple(each.name for each in untried if each.name not in done),
             changes=tuple(sorted(changes, key=lambda each: each.change.relative_change)),
             parts=tuple(self._parts),
-            ultrasound=best_view_words(self._task.lung, self._task.target.lps_mm, self._atlas.motions.tips),
-            **self._found,
+            ultrasound=best_view_words(task.lung, task.target.lps_mm, self._atlas.motions.tips),
+            **found,
         )
-        chances = {name: self._chance(each) for name, each in made.plans.items()}
+        chances = {
+            name: assess(each, task.lung, samples=DRAWS, seed=SEED).succeeds
+            for name, each in made.plans.items()
+        }
         return replace(made, chances=chances, time_s=working_cpu_s() - self._began)
-
-    def _chance(self, plan: Plan) -> Share:
-        return assess(plan, self._task.lung, samples=DRAWS, seed=SEED).succeeds
 
     def _part(self, name: str, do: Callable[[], None], *, at_any_time: bool = False) -> None:
         """Do a part, unless the time is up before or during it and it is not one for any time."""

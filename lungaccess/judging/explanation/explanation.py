@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import field, replace
+from itertools import islice
 
 import numpy as np
 
@@ -108,13 +109,8 @@ class Surroundings:
         task = self._task
         target = Target(lps_mm=point, origin=f"neighbour of {task.target.origin}")
         try:
-            return next(
-                run(
-                    Request.by_cost(replace(task, target=target), limits=Limits(iterations=0)),
-                    atlas=self._atlas,
-                    counterfactuals=False,
-                )
-            )
+            asked = Request.by_cost(replace(task, target=target), limits=Limits(iterations=0))
+            return next(run(asked, atlas=self._atlas, counterfactuals=False))
         except NoPlan:
             return None
 
@@ -133,7 +129,9 @@ class Surroundings:
             return point if self._free(point) and region_of(lung, point) == region else np.full(3, np.nan)
 
         for name, draw in ((f"within {AROUND_MM:g} mm of the target", around), (region, anywhere)):
-            points = _drawn(self._free, draw)
+            # There are fewer points in free tissue where there is hardly any.
+            drawn = (point for point in (draw() for _ in range(100 * DRAWS)) if np.isfinite(point).all())
+            points = list(islice(filter(self._free, drawn), DRAWS))
             reached = 0
             for point in points:
                 alive()
@@ -144,18 +142,6 @@ class Surroundings:
     def _free(self, point: Float) -> bool:
         task = self._task
         return task.lung.label_at(point) & obstacle_bits(task.with_fissures) == 0
-
-
-def _drawn(free: Callable[[Float], bool], draw: Callable[[], Float]) -> list[Float]:
-    """Return DRAWS random points in free tissue, fewer where there is hardly any."""
-    found: list[Float] = []
-    for _ in range(100 * DRAWS):
-        point = draw()
-        if np.isfinite(point).all() and free(point):
-            found.append(point)
-            if len(found) == DRAWS:
-                break
-    return found
 
 
 DONE, NOT_TRIED = "done", "not tried"

@@ -19,22 +19,14 @@ from lungaccess.plans.candidate import (
 )
 from lungaccess.plans.costs import path_costs
 from lungaccess.plans.insertion import scope_insertion
-from lungaccess.plans.parts import (
-    DeployedShape,
-    Exemption,
-    NeedleArc,
-    NeedlePath,
-    ScopeInsertion,
-    TubeDeployment,
-    WallExit,
-)
+from lungaccess.plans.parts import DeployedShape, Exemption, NeedleArc, NeedlePath, TubeDeployment, WallExit
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_kernels, software_version
 from lungaccess.plans.window import BreathingAim
 from lungaccess.problem.system import System, system_fingerprint
 from lungaccess.problem.task import Task
 from stages.needle import ArcPath, InTissue
-from stages.scope import ScopeTip, prove_motion
+from stages.scope import prove_motion
 from stages.tube import Deployment
 
 SAMPLE_MM = 0.05
@@ -46,6 +38,10 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
     system, lung = task.system, task.lung
     frame, deployment, needle = candidate.tip.lps_from_scope_tip, candidate.deployment, system.needle
     path, of_needle = with_tool_in_place(system, candidate.path), {}
+    tip, margin_mm = candidate.tip, prove_motion(lung, system.scope, candidate.tip.motion)
+    if isinstance(margin_mm, str):
+        raise AnatomyError(f"The motion of the scope is not proved: {margin_mm}")
+    margin_mm += system.scope.lumen_margin_mm
     if needle is not None:
         of_needle = {"needle": needle_clearance_mm(task, path, deployment.branch)}
     return Plan(
@@ -61,7 +57,7 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         target_origin=task.target.origin,
         fissures_are_obstacles=task.with_fissures,
         objective=str(task.objective),
-        scope=_scope(task, candidate.tip),
+        scope=scope_insertion(tip.motion, lung.tree, tip.tree_point, margin_mm),
         tube=tube_part(task, frame, deployment),
         needle=None if needle is None else needle_part(path),
         exemption=Exemption(
@@ -136,14 +132,6 @@ def stated_costs(
         parts = [InTissue(path, task.system.require_needle("A path of the needle alone").diameter_mm)]
     found = path_costs(task.lung, path, with_fissures=task.with_fissures, wall_mm=wall_mm, parts=parts)
     return task.objective.stated(found)
-
-
-def _scope(task: Task, tip: ScopeTip) -> ScopeInsertion:
-    lung, scope = task.lung, task.system.scope
-    margin_mm = prove_motion(lung, scope, tip.motion)
-    if isinstance(margin_mm, str):
-        raise AnatomyError(f"The motion of the scope is not proved: {margin_mm}")
-    return scope_insertion(tip.motion, lung.tree, tip.tree_point, margin_mm + scope.lumen_margin_mm)
 
 
 def tube_part(task: Task, lps_from_scope_tip: Float, deployment: Deployment) -> TubeDeployment:

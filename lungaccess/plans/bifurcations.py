@@ -49,11 +49,6 @@ def lps_from_camera(system: System, lps_from_tip: Float) -> Float:
     return np.asarray(lps_from_tip @ aside)
 
 
-def clock_words(hour: int) -> str:
-    """Say where in the picture an hour of `Hole.hour` is."""
-    return f"at {hour} o'clock" if hour else STRAIGHT_AHEAD
-
-
 @frozen_record
 class Hole:
     """The dark region of a picture through which the airway goes on.
@@ -214,7 +209,7 @@ class Opening:
     def words(self) -> str:
         """Where it is, and what it is."""
         which = f"the {ORDINALS[min(self.order, len(ORDINALS)) - 1]} " if self.order else "the one "
-        at = "" if self.side == STRAIGHT_AHEAD else f", {clock_words(self.hour)}"
+        at = "" if self.side == STRAIGHT_AHEAD else f", at {self.hour} o'clock"
         hidden = "" if self.in_view else ", out of view"
         return f"{which}{self.side}{at}{hidden}: {self.name}"
 
@@ -280,7 +275,10 @@ def route_bifurcations(
     """
     tree, tips, state = lung.tree, motion.tips, 0
     depth = tree.distance_from_root_mm
-    passed = depth[_places(tree, int(branches[-1]), tips[:, :3, 3])]
+    # The nearest point on the route to each tip, never going back.
+    route = tree.route(int(tree.branch_start[branches[-1] + 1]) - 1)
+    away = norm(tips[:, None, :3, 3] - tree.points_lps[route][None], axis=2)
+    passed = depth[route[np.maximum.accumulate(np.argmin(away, axis=1))]]
     found = []
     for number, (parent, child) in enumerate(zip(branches[:-1].tolist(), branches[1:].tolist(), strict=True)):
         points, fork = _first_points(tree, parent, child), _fork(tree, child)
@@ -377,18 +375,14 @@ def branch_name(lung: Lung, branch: int) -> str:
         return f"the {_side(tree, branch)} main bronchus ({known})"
     if words := tree.bronchi.words(branch):
         return f"{words} ({known})"
-    lobes = {_lobe(lung, end) for end in _ends(tree, branch)}
+    # The last points of the branches without children at or beyond the branch.
+    leaves = tree.leaf_branches[branches_beyond(tree, int(tree.branch_start[branch]))[tree.leaf_branches]]
+    lobes = {_lobe(lung, end) for end in tree.points_lps[tree.branch_start[leaves + 1] - 1]}
     return f"{known}, to the {lobes.pop()}" if len(lobes) == 1 and "" not in lobes else known
 
 
 def _side(tree: AirwayTree, branch: int) -> str:
     return "left" if tree.points_lps[tree.branch_points(branch)[-1]][0] > tree.carina_lps[0] else "right"
-
-
-def _ends(tree: AirwayTree, branch: int) -> Float:
-    """Return the last points `(N, 3)` of the branches without children at or beyond a branch."""
-    leaves = tree.leaf_branches[branches_beyond(tree, int(tree.branch_start[branch]))[tree.leaf_branches]]
-    return tree.points_lps[tree.branch_start[leaves + 1] - 1]
 
 
 def _lobe(lung: Lung, point_lps: Float) -> str:
@@ -400,13 +394,6 @@ def _lobe(lung: Lung, point_lps: Float) -> str:
 
 def _fork(tree: AirwayTree, branch: int) -> int:
     return int(tree.parent_point[tree.branch_start[branch]])
-
-
-def _places(tree: AirwayTree, last: int, tips_lps: Float) -> Int:
-    """Return for each tip the nearest tree point on the route to the end of a branch, never going back."""
-    route = tree.route(int(tree.branch_start[last + 1]) - 1)
-    away = np.linalg.norm(tips_lps[:, None] - tree.points_lps[route][None], axis=2)
-    return np.asarray(route[np.maximum.accumulate(np.argmin(away, axis=1))])
 
 
 def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Opening, ...]:

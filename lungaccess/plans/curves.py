@@ -85,29 +85,21 @@ def device_curves(
     tube_poses, tube_mm = poses_on_pieces(scope.lps_from_scope_tip, tube_pieces(tube), step_mm)
     start = tube.lps_from_tip if needle is None else needle.lps_from_start
     needle_poses, needle_mm = poses_on_pieces(start, needle_pieces(needle), step_mm)
-    return DeviceCurves(
-        scope=DeviceCurve(
-            name="scope",
-            lps_from_device=scope_poses,
-            radius_mm=np.full(len(scope_mm), system.scope.radius_mm),
-            arc_length_mm=scope_mm,
-            colour=(0.12, 0.47, 0.71),
-        ),
-        tubes=DeviceCurve(
-            name="tubes",
-            lps_from_device=tube_poses,
-            radius_mm=tube_radii(tube, tubes, tube_mm),
-            arc_length_mm=tube_mm,
-            colour=(1.0, 0.5, 0.05),
-        ),
-        needle=DeviceCurve(
-            name="needle",
-            lps_from_device=needle_poses,
-            radius_mm=np.full(len(needle_mm), 0.0 if system.needle is None else system.needle.radius_mm),
-            arc_length_mm=needle_mm,
-            colour=(0.1, 0.1, 0.1),
-        ),
+    needle_radius_mm = 0.0 if system.needle is None else system.needle.radius_mm
+    devices = (
+        ("scope", scope_poses, scope_mm, system.scope.radius_mm, (0.12, 0.47, 0.71)),
+        ("tubes", tube_poses, tube_mm, tube_radii(tube, tubes, tube_mm), (1.0, 0.5, 0.05)),
+        ("needle", needle_poses, needle_mm, needle_radius_mm, (0.1, 0.1, 0.1)),
     )
+    return DeviceCurves(
+        *(
+            DeviceCurve(
+                name=name, lps_from_device=poses, radius_mm=np.broadcast_to(radius_mm, len(arc_mm)).copy(),
+                arc_length_mm=arc_mm, colour=colour,
+            )
+            for name, poses, arc_mm, radius_mm, colour in devices
+        )
+    )  # fmt: skip
 
 
 def tube_pieces(tube: TubeDeployment) -> Float:

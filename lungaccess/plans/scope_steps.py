@@ -84,7 +84,9 @@ class ScopeStep:
         said = []
         if self.twist_deg != 0.0:
             turn = f"turn the scope {_number(abs(self.twist_deg))}° {_way(self.twist_deg)}"
-            said.append(f"{turn} (seen from behind), to {twist_words(self.to_twist_deg)}")
+            twist = _number(abs(self.to_twist_deg))
+            way = "" if twist == "0" else f" {_way(self.to_twist_deg)}"
+            said.append(f"{turn} (seen from behind), to {twist}°{way}")
         if self.to_bend_deg != self.from_bend_deg:
             bends = bend_words(self.from_bend_deg), bend_words(self.to_bend_deg)
             said.append("bring the tip from {} to {}".format(*bends))
@@ -118,12 +120,6 @@ def _tolerance(value: float, most: float, unit: str) -> str:
 
 def _way(twist_deg: float) -> str:
     return "clockwise" if twist_deg > 0.0 else "counterclockwise"
-
-
-def twist_words(twist_deg: float) -> str:
-    """Return a twist in words, such as "20° clockwise"."""
-    number = _number(abs(twist_deg))
-    return "0°" if number == "0" else f"{number}° {_way(twist_deg)}"
 
 
 def bend_words(bend_deg: float) -> str:

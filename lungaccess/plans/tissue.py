@@ -25,23 +25,19 @@ def wanted_of(lung: Lung, target_lps: Float, tool: Tool | None, radius_mm: float
         radius_mm: The nodule counts as a ball of that radius; if None, it is that of the mask where there is
             one.
     """
-    radius, _origin = goal_radius(lung, target_lps, radius_mm)
-    own = own_nodule(lung, target_lps) if tool is not None and radius_mm is None else None
-    return wanted_in(np.array(target_lps, dtype=np.float64), tool, radius, own, lung.grid)
-
-
-def wanted_in(
-    target: Float, tool: Tool | None, radius_mm: float, own: Int | None = None, grid: Grid | None = None
-) -> Wanted:
-    """Return what has to be in a tool of a nodule: of voxels `(V, 3)` of a grid, or of a ball."""
+    target, (radius, _origin) = (
+        np.array(target_lps, dtype=np.float64),
+        goal_radius(lung, target_lps, radius_mm),
+    )
     if tool is None:
         tip = np.zeros((1, 3))
-        return Wanted(target, tip, 1.0, *_NO_VOXELS, 0.0, radius_mm, _NO_POINTS, 0.0, 0.0, 0.0, False, 1.0)
+        return Wanted(target, tip, 1.0, *_NO_VOXELS, 0.0, radius, _NO_POINTS, 0.0, 0.0, 0.0, False, 1.0)
     points, covered, (tissue, geometry) = tool.points(), _NO_POINTS, _NO_VOXELS
-    outer = radius_mm + tool.margin_mm
-    inner = max(radius_mm - tool.rim_mm, 0.0) if tool.rim_mm else 0.0
-    if own is not None and grid is not None:
-        tissue, geometry = _counted(tool, own, grid)
+    outer = radius + tool.margin_mm
+    inner = max(radius - tool.rim_mm, 0.0) if tool.rim_mm else 0.0
+    own = own_nodule(lung, target_lps) if radius_mm is None else None
+    if own is not None:
+        tissue, geometry = _counted(tool, own, lung.grid)
     weight = {"mm": tool.length_mm, "mm3": tool.volume_mm3, "share": 0.0}[tool.unit] / len(points)
     if tool.unit == "share":
         covered = _spread_over(tissue, geometry, target, (inner, outer))

@@ -135,11 +135,10 @@ class BreathingWindow(Record):
     @property
     def words(self) -> str:
         """The window in sentences, where an aim is, and whether it is a warning only."""
-        beside = self.beside_target_mm
-        aim = (
-            f" In the phase of the masks the devices end {beside:.1f} mm beside the target." if beside else ""
-        )
-        return f"{self._stretches}{aim}" + (f" {WARNING}" if self.warning_only else "")
+        said, beside = self._stretches, self.beside_target_mm
+        if beside:
+            said += f" In the phase of the masks the devices end {beside:.1f} mm beside the target."
+        return f"{said} {WARNING}" if self.warning_only else said
 
     @property
     def _stretches(self) -> str:

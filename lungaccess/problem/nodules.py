@@ -60,13 +60,12 @@ def find_nodule(organ: Organ, number: int) -> Nodule:
         )
     if number == 0:
         return max(found, key=lambda each: len(each.voxels))
-    for each in found:
-        if each.number == number:
-            return each
+    named = {each.number: each for each in found}
+    if number in named:
+        return named[number]
+    expected = f"a number from 1 to {len(found)}, 1 being the largest"
     if found[0].is_label:
-        expected = f"one of the labels {', '.join(str(each.number) for each in found)} of the mask"
-    else:
-        expected = f"a number from 1 to {len(found)}, 1 being the largest"
+        expected = f"one of the labels {', '.join(map(str, named))} of the mask"
     raise TargetError(
         f"There is no nodule {number}",
         expected=expected,

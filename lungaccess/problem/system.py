@@ -81,10 +81,16 @@ class System:
             raise impossible(
                 f"tubes.{name}.outer_diameter_mm", outer, f"less than scope.channel_diameter_mm = {channel:g}"
             )
-        if self.needle is None:
-            self._check_aim()
-        else:
+        if self.needle is not None:
             self._check_needle(self.needle)
+        elif self.tubes.outer is None or not any(tube.bends for tube in self.tubes.nested):
+            # Without a needle the tip of the tubes must come to points in space, not on a line only.
+            raise impossible(
+                "needle",
+                None,
+                "the table [needle], or else two tubes or three of which one is bent: the tip of one tube or "
+                "of straight ones comes only to a line or surface from each place of the scope",
+            )
         if self.tool is not None and self.needle is None:
             raise impossible("tool", self.tool.name, "no table [tool] where there is no [needle] to lead it")
         if self.needle_preloaded:
@@ -92,16 +98,6 @@ class System:
         # The shaft bends with the tubes while they are deployed, if it is in them then.
         shaft = self.needle_tube if self.needle_preloaded else None
         object.__setattr__(self, "tubes", self.tubes.with_needle(shaft))
-
-    def _check_aim(self) -> None:
-        """Without a needle the tip of the tubes must come to points in space, not on a line only."""
-        if self.tubes.outer is None or not any(tube.bends for tube in self.tubes.nested):
-            raise impossible(
-                "needle",
-                None,
-                "the table [needle], or else two tubes or three of which one is bent: the tip of one tube or "
-                "of straight ones comes only to a line or surface from each place of the scope",
-            )
 
     def _check_needle(self, needle: Needle) -> None:
         bore = self.tubes.inner.inner_diameter_mm

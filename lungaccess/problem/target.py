@@ -85,7 +85,6 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
         return StatedTarget(lps_mm=read_named_point(saved).lps_mm, nodule=0, origin=f"point {saved}")
     if text and not set(text) & set(":,;[( "):
         return StatedTarget(lps_mm=None, nodule=0, origin=f"published {text}", name=text)
-
     return StatedTarget(lps_mm=parse_point(text), nodule=0, origin=f"point {text}")
 
 
@@ -115,9 +114,7 @@ def resolve_target(lung: Organ, text: str | None = None, nodule: int | None = No
         FrameError: If the text states no frame.
         TargetError: If there is no such nodule, or the point lies outside the lung or inside an obstacle.
     """
-    if text is None and nodule is None:
-        nodule = 0
-    return stated_target(text, None if text is not None else nodule).resolve(lung)
+    return stated_target(text, (nodule or 0) if text is None else None).resolve(lung)
 
 
 def point_target(lung: Organ, lps_mm: Float, *, origin: str = "point") -> Target:
@@ -184,13 +181,9 @@ def _outside(lung: Organ, point: Float, origin: str) -> TargetError:
     frame, _, numbers = origin.removeprefix("point ").partition(":")
     other = {"ras": "lps", "lps": "ras"}.get(frame.strip().lower(), "")
     typed = f"--target {other}:{numbers}" if other else f"the point {point_in_words(flipped)}"
+    inside = f"in {other.upper()} the same numbers lie" if other else "with x and y negated it lies"
     return TargetError(
-        f"The target at {point_in_words(point)} lies outside the {where}"
-        + (
-            f"; in {other.upper()} the same numbers lie inside"
-            if other
-            else "; with x and y negated it lies inside"
-        ),
+        f"The target at {point_in_words(point)} lies outside the {where}; {inside} inside",
         expected=f"a point in {organ} tissue, in the frame that is stated",
         remedy=f"If that is meant, state {typed}",
     )
@@ -239,9 +232,10 @@ def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
     if lung.has_fissures:
         structures["fissure"] = FISSURE
     nearest = int(np.argmin(np.linalg.norm(lung.tree.points_lps - point, axis=1)))
+    in_nodule = lung.nodules is not None and lung.nodules.at(point, False)
     return Place(
         lps_mm=point,
-        tissue=next((name for bit, name in TISSUES if label & bit), _free_tissue(lung, point)),
+        tissue=next((name for bit, name in TISSUES if label & bit), "nodule" if in_nodule else "lung tissue"),
         lobe=lung.lobe_at(point),
         distance_mm={
             name: float(lung.exact_clearance_mm(point[None], bits, cap_mm=CAP_MM)[0])
@@ -250,9 +244,3 @@ def describe_place(lung: Lung, lps_mm: ArrayLike) -> Place:
         generation=int(lung.tree.generation[lung.tree.branch_of_point[nearest]]),
         may_be_target=label & obstacle_bits(False) == 0,
     )
-
-
-def _free_tissue(lung: Lung, point: Float) -> str:
-    """Name tissue that is no structure."""
-    nodules = lung.nodules
-    return "nodule" if nodules is not None and nodules.at(point, False) else "lung tissue"

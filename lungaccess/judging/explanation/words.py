@@ -1,7 +1,7 @@
 """An explanation in words, for the terminal and the page alike, and as plain values and files."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,8 @@ from anatomy.base.records import frozen_value
 from anatomy.base.typed import Float
 from anatomy.base.words import of_hundred, percent, point_in_words
 from anatomy.io.frames import LPS_FROM_RAS
-from lungaccess.judging.answering import Attempt
 from lungaccess.judging.explanation.blocking import ArcBeyondLimits, BlockedArc, Structure
-from lungaccess.judging.explanation.explanation import Change, Explanation
+from lungaccess.judging.explanation.explanation import Explanation
 from lungaccess.plans.record import picked
 from lungaccess.plans.version import made_by
 
@@ -31,36 +30,37 @@ class Section:
 def sections(explanation: Explanation) -> tuple[Section, ...]:
     """Return the sections of an explanation that have something to say, the most useful first."""
     e = explanation
-    made = (
-        Section(title="What would reach it", headings=("what", "how", "plan"), rows=tuple(_helps(e))),
-        Section(title="Nearest miss", headings=("what", "how near", "where"), rows=tuple(_misses(e))),
-        Section(
-            title="What blocks the direct arcs within the needle's limits",
-            headings=("structure", "arcs that it stops first", "where most of them are stopped"),
-            rows=tuple(_blocks(e)),
+    starts = {} if e.starts is None else e.starts.counts
+    said: tuple[tuple[str, tuple[str, ...], Iterable[Row]], ...] = (
+        ("What would reach it", ("what", "how", "plan"), _helps(e)),
+        ("Nearest miss", ("what", "how near", "where"), _misses(e)),
+        (
+            "What blocks the direct arcs within the needle's limits",
+            ("structure", "arcs that it stops first", "where most of them are stopped"),
+            _blocks(e),
         ),
-        Section(
-            title=f"Other presets, the least invasive first: {len(e.attempts)} of {len(e.presets)} tried",
-            headings=("preset", "outcome", "plan"),
-            rows=tuple(_presets(e)),
+        (
+            f"Other presets, the least invasive first: {len(e.attempts)} of {len(e.presets)} tried",
+            ("preset", "outcome", "plan"),
+            (
+                (name, "not tried", "") if tried is None else (name, tried.why, _file(e, tried.plan))
+                for name, tried in e.presets.items()
+            ),
         ),
-        Section(
-            title="Where the needle can start, and why each start fails",
-            headings=("starts", "count"),
-            rows=() if e.starts is None else tuple((why, str(n)) for why, n in e.starts.counts.items() if n),
+        (
+            "Where the needle can start, and why each start fails",
+            ("starts", "count"),
+            ((why, str(n)) for why, n in starts.items() if n),
         ),
-        Section(
-            title=f"What {_by(e)} nearby",
-            headings=("where", "how much"),
-            rows=tuple((share.region, share.words) for share in e.shares),
-        ),
-        Section(title="Proof", headings=("question", "answer"), rows=tuple(_proof(e))),
-        Section(
-            title="Not tried: nothing follows from these",
-            headings=("what", "why"),
-            rows=tuple((part.name, part.why) for part in e.not_tried),
+        (f"What {_by(e)} nearby", ("where", "how much"), ((each.region, each.words) for each in e.shares)),
+        ("Proof", ("question", "answer"), _proof(e)),
+        (
+            "Not tried: nothing follows from these",
+            ("what", "why"),
+            ((part.name, part.why) for part in e.not_tried),
         ),
     )
+    made = (Section(title=title, headings=heads, rows=tuple(rows)) for title, heads, rows in said)
     return tuple(section for section in made if section.rows)
 
 
@@ -114,11 +114,6 @@ def _blocks(e: Explanation) -> Iterator[Row]:
         )
 
 
-def _presets(e: Explanation) -> Iterator[Row]:
-    for name, attempt in e.presets.items():
-        yield (name, "not tried", "") if attempt is None else (name, attempt.why, _file(e, attempt.plan))
-
-
 def _proof(e: Explanation) -> Iterator[Row]:
     if e.verdict is None:
         return
@@ -151,7 +146,7 @@ def save_explanation(explanation: Explanation, folder: str | os.PathLike[str]) -
 
 def explanation_record(explanation: Explanation) -> Record:
     """Return an explanation as plain values: lengths in mm, points in LPS and RAS mm."""
-    e = explanation
+    e, near = explanation, explanation.neighbour
     return {
         **made_by(),
         "found": False,
@@ -175,13 +170,37 @@ def explanation_record(explanation: Explanation) -> Record:
             if e.blocked_arc is None
             else {**_numbers(e.blocked_arc), **_structure(e.blocked_arc.structure)},
             "path_beyond_the_limits": None if e.arc_beyond_limits is None else _numbers(e.arc_beyond_limits),
-            "nearest_point_reached": _neighbour(e),
+            "nearest_point_reached": None
+            if near is None
+            else {
+                **point(near.plan.target_lps),
+                "from_target_mm": near.from_target_mm,
+                "plan": e.file_of(near.plan),
+            },
         },
         "presets": [
-            {"system": name, "tried": False} if attempt is None else _attempt(e, attempt)
+            {"system": name, "tried": False}
+            if attempt is None
+            else {
+                "system": attempt.system.name,
+                "tried": True,
+                "found": attempt.succeeded,
+                "why": attempt.why,
+                "plan": e.file_of(attempt.plan),
+            }
             for name, attempt in e.presets.items()
         ],
-        "changes": [_change(e, each) for each in e.changes],
+        "changes": [
+            {
+                "change": str(each.change),
+                "parameter": each.change.parameter,
+                "present_mm": each.change.present,
+                "needed_mm": each.change.needed,
+                "accepted": each.accepted,
+                "plan": e.file_of(each.change.plan),
+            }
+            for each in e.changes
+        ],
         "through_fissures": e.through_fissures,
         "reached_shares": [
             {
@@ -222,35 +241,3 @@ def _structure(structure: Structure) -> Record:
 
 def _numbers(arc: BlockedArc | ArcBeyondLimits) -> Record:
     return {name: value for name, value in vars(arc).items() if isinstance(value, int | float)}
-
-
-def _neighbour(e: Explanation) -> Record | None:
-    neighbour = e.neighbour
-    if neighbour is None:
-        return None
-    return {
-        **point(neighbour.plan.target_lps),
-        "from_target_mm": neighbour.from_target_mm,
-        "plan": e.file_of(neighbour.plan),
-    }
-
-
-def _attempt(e: Explanation, attempt: Attempt) -> Record:
-    return {
-        "system": attempt.system.name,
-        "tried": True,
-        "found": attempt.succeeded,
-        "why": attempt.why,
-        "plan": e.file_of(attempt.plan),
-    }
-
-
-def _change(e: Explanation, change: Change) -> Record:
-    return {
-        "change": str(change.change),
-        "parameter": change.change.parameter,
-        "present_mm": change.change.present,
-        "needed_mm": change.change.needed,
-        "accepted": change.accepted,
-        "plan": e.file_of(change.change.plan),
-    }

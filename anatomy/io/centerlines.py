@@ -42,15 +42,6 @@ class VtkPiece:
     cell_types: Array | None
 
 
-@frozen_record
-class VtkFile:
-    """The pieces of a file and its field data by name."""
-
-    kind: str
-    pieces: list[VtkPiece]
-    field_data: dict[str, Array]
-
-
 class _Reader:
     """The bytes of a file and how its arrays are stored."""
 
@@ -70,7 +61,8 @@ class _Reader:
         self.order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
         self.header = np.dtype(self.order + _HEADER_TYPES[self.root.get("header_type", "UInt32")])
 
-    def file(self) -> VtkFile:
+    def contents(self) -> tuple[list[VtkPiece], dict[str, Array]]:
+        """Return the pieces of the file, and its field data by name."""
         kind = self.root.get("type", "")
         if self.root.tag != "VTKFile" or kind not in ("PolyData", "UnstructuredGrid"):
             raise ValueError(f"it is <{self.root.tag} type={kind!r}>, not PolyData or UnstructuredGrid")
@@ -79,10 +71,7 @@ class _Reader:
             raise ValueError(f"it has no <{kind}> element")
         cells = "Lines" if kind == "PolyData" else "Cells"
         pieces = [self.piece(piece, cells) for piece in data.iter("Piece")]
-        field = {}
-        for parent in (self.root, data):
-            field.update(self.named(parent.find("FieldData")))
-        return VtkFile(kind=kind, pieces=pieces, field_data=field)
+        return pieces, self.named(self.root.find("FieldData")) | self.named(data.find("FieldData"))
 
     def piece(self, piece: Element, cells: str) -> VtkPiece:
         count = int(piece.get("NumberOfPoints", "0"))
@@ -195,10 +184,10 @@ def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tu
     with reading(path):
         if path.stat().st_size > MOST_BYTES:
             raise ValueError(f"it has more than {MOST_BYTES >> 20} MiB")
-        file = _Reader(path.read_bytes()).file()
-    lps_from_file = LPS_FROM[_frame(file, path, frame)]
+        pieces, field_data = _Reader(path.read_bytes()).contents()
+    lps_from_file = LPS_FROM[_frame(field_data, path, frame)]
     points, radii, edges, count = [], [], [], 0
-    for piece in file.pieces:
+    for piece in pieces:
         points.append(piece.points)
         radii.append(_radius(piece, path))
         edges.append(_edges(piece, path) + count)
@@ -219,8 +208,8 @@ def read_centerline_graph(path: str | Path, *, frame: Frame | None = None) -> tu
     return lps, np.concatenate(radii), np.concatenate(edges)
 
 
-def _frame(file: VtkFile, path: str | Path, given: Frame | None) -> Frame:
-    text = bytes(file.field_data.get("SPACE", np.zeros(0, np.uint8)).astype(np.uint8)).decode("latin-1")
+def _frame(field_data: dict[str, Array], path: str | Path, given: Frame | None) -> Frame:
+    text = bytes(field_data.get("SPACE", np.zeros(0, np.uint8)).astype(np.uint8)).decode("latin-1")
     named = text.strip("\0 ").removeprefix("SPACE=").lower()
     stated = {"lps": "lps", "left-posterior-superior": "lps", "ras": "ras", "right-anterior-superior": "ras"}
     if named and named not in stated:
@@ -246,25 +235,21 @@ def _frame(file: VtkFile, path: str | Path, given: Frame | None) -> Frame:
 
 
 def _radius(piece: VtkPiece, path: str | Path) -> Float:
-    for name in RADIUS_NAMES:
-        if name in piece.point_data:
-            radius = piece.point_data[name].astype(np.float64)
-            if (
-                radius.shape != (len(piece.points),)
-                or not (radius >= 0).all()
-                or not np.isfinite(radius).all()
-            ):
-                raise FileError(
-                    f"{path} has radii in {name!r} that are negative or no numbers",
-                    expected="one length in mm a point",
-                    remedy="Export the centreline again",
-                )
-            return radius
-    raise FileError(
-        f"{path} has no radius; its point arrays are {sorted(piece.point_data)}",
-        expected=f"a point array named {', '.join(RADIUS_NAMES)}",
-        remedy="Export the centreline with its radius",
-    )
+    name = next((name for name in RADIUS_NAMES if name in piece.point_data), None)
+    if name is None:
+        raise FileError(
+            f"{path} has no radius; its point arrays are {sorted(piece.point_data)}",
+            expected=f"a point array named {', '.join(RADIUS_NAMES)}",
+            remedy="Export the centreline with its radius",
+        )
+    radius = piece.point_data[name].astype(np.float64)
+    if radius.shape != (len(piece.points),) or not ((radius >= 0) & np.isfinite(radius)).all():
+        raise FileError(
+            f"{path} has radii in {name!r} that are negative or no numbers",
+            expected="one length in mm a point",
+            remedy="Export the centreline again",
+        )
+    return radius
 
 
 def _edges(piece: VtkPiece, path: str | Path) -> Int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -228,8 +228,7 @@ def _choose(by_uid: dict[str, list[tuple[Path, Any]]], series_uid: str | None, f
     )
 
 
-def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
-    headers = list(headers)
+def _require_uniform(headers: Sequence[FileDataset], where: str) -> None:
     first = headers[0]
     if first.get("Modality") != "CT":
         raise FileError(
@@ -262,20 +261,13 @@ def _require_uniform(headers: Iterable[FileDataset], where: str) -> None:
 
 def _require_grey_values(first: FileDataset, where: str) -> None:
     """Refuse slices that do not hold one Hounsfield unit a pixel; all slices say the same as the first."""
-    slope, samples, shown_as = (
-        float(first.RescaleSlope),
-        int(first.SamplesPerPixel),
-        first[_GREY_KEYS[1]].value,
-    )
-    if (
-        (samples, shown_as) != (1, "MONOCHROME2")
-        or slope == 0
-        or not np.isfinite([slope, float(first.RescaleIntercept)]).all()
-        or first.get("RescaleType", "HU") not in _HOUNSFIELD_TYPES
-    ):
+    slope, samples = float(first.RescaleSlope), int(first.SamplesPerPixel)
+    shown_as, unit = first[_GREY_KEYS[1]].value, first.get("RescaleType", "HU")
+    scaled = slope != 0 and np.isfinite([slope, float(first.RescaleIntercept)]).all()
+    if (samples, shown_as) != (1, "MONOCHROME2") or not scaled or unit not in _HOUNSFIELD_TYPES:
         raise FileError(
             f"{where} has {samples} samples a pixel, shown as {shown_as}, RescaleSlope {slope:g}, "
-            f"RescaleIntercept {first.RescaleIntercept} and RescaleType {first.get('RescaleType', 'HU')}",
+            f"RescaleIntercept {first.RescaleIntercept} and RescaleType {unit}",
             expected="one MONOCHROME2 sample a pixel, which slope and intercept turn into Hounsfield units",
             remedy="Export the CT series again, not a picture of it",
         )

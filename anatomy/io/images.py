@@ -135,11 +135,8 @@ def read_parts(
         mask_of(volume.array, path.name, voxel_mm3=voxel_mm3, role=role, labels=labels)
         for role, labels in parts
     ]
-    return (
-        volume.grid,
-        [mask for mask, _ in found],
-        tuple(dict.fromkeys(s for _, said in found for s in said)),
-    )
+    said = dict.fromkeys(each for _, told in found for each in told)
+    return volume.grid, [mask for mask, _ in found], tuple(said)
 
 
 def read_labels(path: str | Path) -> Mapping[int, str]:

@@ -263,11 +263,7 @@ def without_throat(lumen: Mask, seed_ijk: Int, grid: Grid) -> tuple[Mask, float]
     trachea.
     """
     slice_mm = float(grid.spacing_mm[2])
-    level = throat_level(lumen, seed_ijk, slice_mm)
-    top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1 if lumen.any() else 0
-    if level >= top:
-        return lumen, 0.0
-    return below(lumen, level), (top - level) * slice_mm
+    return _below(lumen, throat_level(lumen, seed_ijk, slice_mm), slice_mm)
 
 
 def without_top(
@@ -281,19 +277,20 @@ def without_top(
     """
     lumen, cut_mm = without_throat(lumen, seed_ijk, grid)
     if isinstance(tree_of(lumen), AnatomyError):
-        level = narrowest_level(lumen, seed_ijk)
-        lower = below(lumen, level)
+        lower, more_mm = _below(lumen, narrowest_level(lumen, seed_ijk), float(grid.spacing_mm[2]))
         if not isinstance(tree_of(lower), AnatomyError):
-            top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1
-            return lower, cut_mm + (top - level) * float(grid.spacing_mm[2])
+            return lower, cut_mm + more_mm
     return lumen, cut_mm
 
 
-def below(lumen: Mask, level: int) -> Mask:
-    """Return an airway without what lies at an axial level and above."""
+def _below(lumen: Mask, level: int, slice_mm: float) -> tuple[Mask, float]:
+    """Return an airway without what lies at an axial level and above, and how long that was, mm."""
+    top = int(np.flatnonzero(lumen.any(axis=(0, 1)))[-1]) + 1 if lumen.any() else 0
+    if level >= top:
+        return lumen, 0.0
     cut = np.array(lumen, order="F")
     cut[:, :, level:] = False
-    return cut
+    return cut, (top - level) * slice_mm
 
 
 def throat_level(air: Mask, seed_ijk: Int, slice_mm: float) -> int:

@@ -78,15 +78,12 @@ def read_network(path: Path) -> Network:
             expected=f"a network as a file that ends with {SUFFIX}",
             remedy="Export it with torch.onnx.export, or check the name",
         )
-    beside = path.with_suffix(".toml")
-    content = (
-        read_toml(beside, expected="lines such as low_hu = -1000", remedy="Correct it")
-        if beside.is_file()
-        else {}
-    )
+    beside, content, digest = path.with_suffix(".toml"), {}, sha256(path)
+    if beside.is_file():
+        content = read_toml(beside, expected="lines such as low_hu = -1000", remedy="Correct it")
+        digest += sha256(beside)
     chosen = parse(NetworkSettings, content, beside.name)
     stated = "; ".join(f"{key} {value}" for key, value in content.items()) or "settings by default"
-    digest = sha256(path) + (sha256(beside) if beside.is_file() else "")
     return Network(path=path, settings=chosen, digest=digest, words=f"the network {path.name} ({stated})")
 
 

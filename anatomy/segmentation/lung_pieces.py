@@ -162,8 +162,7 @@ def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
     # Near the edge of the image a closing cannot tell notch from outside.
     for axis, n in enumerate(np.ceil(NOTCH_MM / np.asarray(ct.spacing_mm)).astype(np.int64)):
         layers = np.moveaxis(near, axis, 0)
-        layers[:n] = False
-        layers[-n:] = False
+        layers[:n] = layers[-n:] = False
     return near
 
 

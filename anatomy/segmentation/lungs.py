@@ -92,7 +92,16 @@ def segment_lungs(
         airway, tissue = _airway_and_lung(coarse, outside, airways, threshold)
         gas, tissue = gas_pockets(coarse, tissue, air_in_hu(coarse, airway.grown))
         sides, warnings = _coarse_sides(coarse, tissue, airway)
-        warnings = (*scale.warnings(), *warnings, *_gas_warning(coarse, gas))
+        warnings = (*scale.warnings(), *warnings)
+        if gas.any():
+            place = ", ".join(f"{x:.0f}" for x in coarse.grid.lps(np.argwhere(gas).mean(axis=0)))
+            said = (
+                f"{np.count_nonzero(gas) * coarse.voxel_ml:.0f} ml of gas without tissue lie in the lungs, "
+                f"about LPS ({place}) mm: a pneumothorax, a bulla, or stomach or bowel beside the lung. It "
+                "is no lung, and no needle is steered in it; a lung beside a pneumothorax lies elsewhere "
+                "once it is drained."
+            )
+            warnings = (*warnings, said)
         tell("lungs: nodules on the pleura")
         added = notches(coarse, sides == RIGHT, sides == LEFT, CLOSING_MM)
     tell("lungs: boundary")
@@ -203,17 +212,6 @@ def _coarse_sides(coarse: CoarseCt, tissue: Mask, airway: CentralAirway) -> tupl
     side, name = (RIGHT, "right") if centre < airway.seed[0] else (LEFT, "left")
     warning = f"Only one lung was found, or the two could not be told apart; it is taken as the {name} one."
     return np.asfortranarray(tissue * np.int32(side)), (warning,)
-
-
-def _gas_warning(coarse: CoarseCt, gas: Mask) -> tuple[str, ...]:
-    if not gas.any():
-        return ()
-    place = ", ".join(f"{x:.0f}" for x in coarse.grid.lps(np.argwhere(gas).mean(axis=0)))
-    return (
-        f"{np.count_nonzero(gas) * coarse.voxel_ml:.0f} ml of gas without tissue lie in the lungs, about LPS "
-        f"({place}) mm: a pneumothorax, a bulla, or stomach or bowel beside the lung. It is no lung, and "
-        "no needle is steered in it; a lung beside a pneumothorax lies elsewhere once it is drained.",
-    )
 
 
 def _fine_lung(

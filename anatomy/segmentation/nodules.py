@@ -35,7 +35,12 @@ def nodule_from_contours(path: str | Path, grid: Grid) -> Mask:
     slices of the image are not axial.
     """
     annotations = _annotations(Path(path))
-    _require_axial(grid)
+    if not np.abs(np.abs(grid.lps_from_ijk[:3, :3] / grid.spacing_mm) - np.eye(3)).max() <= 1e-3:
+        raise GridMismatchError(
+            "Contours in columns and rows were given for an image that is not axial",
+            expected="the CT whose slices the contours were drawn in",
+            remedy="Give the nodule as a mask with --nodule-mask",
+        )
     with reading(path):
         masks = [annotation_mask(annotation, grid, Path(path)) for annotation in annotations]
     votes = np.zeros(grid.shape, dtype=np.int16, order="F")
@@ -64,27 +69,12 @@ def _is_contour(contour: Any) -> bool:
         height = float(contour["z_mm"])
     except DAMAGE:
         return False
-    return (
-        math.isfinite(height)
-        and points.ndim == 2
-        and points.shape[1] == 2
-        and len(points) > 0
-        and bool(np.isfinite(points).all())
-    )
+    shaped = points.ndim == 2 and points.shape[1] == 2 and len(points) > 0
+    return shaped and math.isfinite(height) and bool(np.isfinite(points).all())
 
 
 def _not_contours(path: Path, what: str) -> FileError:
     return FileError(f"{path} {what}", expected=_CONTOURS, remedy=_REMEDY)
-
-
-def _require_axial(grid: Grid) -> None:
-    direction = np.abs(grid.lps_from_ijk[:3, :3] / grid.spacing_mm)
-    if not np.abs(direction - np.eye(3)).max() <= 1e-3:
-        raise GridMismatchError(
-            "Contours in columns and rows were given for an image that is not axial",
-            expected="the CT whose slices the contours were drawn in",
-            remedy="Give the nodule as a mask with --nodule-mask",
-        )
 
 
 def annotation_mask(annotation: Mapping[str, Any], grid: Grid, path: Path) -> Mask:

@@ -101,7 +101,12 @@ def read_given(files: Mapping[str, Path], folder: Path | None, grid: Grid) -> Gi
 
 def _read(image: str, path: Path) -> _Read:
     if path.is_dir():
-        return _one_of_folder(image, path)
+        case = ct_case(path)
+        own = None if case is None else {"airway": case.airway, "lungs": case.lungs}.get(image)
+        if case is None or own is None:
+            return _of_sources(image, mask_sources(path)[0], path.name)
+        read = _read(image, own)
+        return replace(read, source=f"{read.source} ({case.data_set})")
     file, stated = file_and_label(path)
     if file != path:
         labels = parse_labels(stated)
@@ -139,16 +144,6 @@ def _of_file(image: str, path: Path, labels: tuple[int, ...], source: str) -> _R
     if image == "lobes":
         found = Volume(grid=volume.grid, array=lobe_numbers(found, source))
     return _Read(volume=found, source=source, said=said)
-
-
-def _one_of_folder(image: str, folder: Path) -> _Read:
-    case = ct_case(folder)
-    if case is not None:
-        path = {"airway": case.airway, "lungs": case.lungs}.get(image)
-        if path is not None:
-            read = _read(image, path)
-            return replace(read, source=f"{read.source} ({case.data_set})")
-    return _of_sources(image, mask_sources(folder)[0], f"{folder.name}")
 
 
 def _all_of_folder(folder: Path) -> dict[str, _Read]:
@@ -191,14 +186,11 @@ def _of_sources(image: str, sources: Sequence[MaskSource], name: str) -> _Read:
     array: Array = read.masks[role] if role in read.masks else np.asarray(read.lobes)
     if image == "lungs" and role not in read.masks:
         array = sides_of_lobes(array)
-    files = ", ".join(dict.fromkeys(_shown(source) for source in fitting))
+    labels = [f" label {', '.join(map(str, source.labels))}" if source.labels else "" for source in fitting]
+    shown = (f"{source.path.name}{label}" for source, label in zip(fitting, labels, strict=True))
+    files = ", ".join(dict.fromkeys(shown))
     source = f"{name} (TotalSegmentator: {files})"
     return _Read(volume=Volume(grid=read.grid, array=array), source=source, said=read.statements)
-
-
-def _shown(source: MaskSource) -> str:
-    labels = ", ".join(map(str, source.labels))
-    return f"{source.path.name}{f' label {labels}' if labels else ''}"
 
 
 def _plain(image: str) -> str:

@@ -225,10 +225,8 @@ def quality_of(parts: Parts) -> Quality:
 
 
 def _leaks(tree: AirwayTree) -> list[str]:
-    radius = np.asarray(tree.branch_mean_radius_mm)
-    parent = np.asarray(tree.branch_parent)
-    # A bronchus is never so much wider than its parent; a leak is.
-    # A branch this much wider than its parent, and at least so wide, looks like a leak into the lung.
+    radius, parent = np.asarray(tree.branch_mean_radius_mm), np.asarray(tree.branch_parent)
+    # A bronchus is never so much wider than its parent, and so wide; a leak into the lung is.
     wide = (parent >= 0) & (radius >= 2.5) & (radius > 1.6 * radius[np.maximum(parent, 0)])
     found = []
     for branch in np.flatnonzero(wide):

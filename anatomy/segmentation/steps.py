@@ -110,16 +110,8 @@ class Steps:
         vessels = self._vessels(lungs, airway, nodule)
         lobes = self._lobes(lungs, airway, vessels, tree)
         cost = self._cost(lungs, airway, nodule, vessels)
-        return replace(
-            begun,
-            nodule=nodule,
-            vesselness=vessels["vesselness"],
-            large_vessels=vessels["vessels"],
-            all_vessels=vessels["all_vessels"],
-            lobes=lobes["lobes"],
-            fissures=lobes["fissures"],
-            cost=cost,
-        )
+        more: dict[str, Any] = {**vessels, **lobes, "nodule": nodule, "cost": cost}
+        return replace(begun, large_vessels=more.pop("vessels"), **more)
 
     def _lungs(self) -> Lungs:
         request, whole = self._request, self._box
@@ -235,9 +227,9 @@ class Steps:
         stated = {"contours": given.nodule_contours, "mask": given.nodule_mask}
         files = {name: sha256(path) for name, path in stated.items() if path is not None}
         points = [parse_point(point).tolist() for point in given.nodules]
-        made_of: dict[str, Any] = (
-            {"points": points, "ct": self._ct_digest, "of": ("lungs",)} if points else {}
-        )
+        made_of: dict[str, Any] = {}
+        if points:
+            made_of = {"points": points, "ct": self._ct_digest, "of": ("lungs",)}
         key = self._key("nodule", sources=("nodule",), grid=folders.grid_digest(grid), files=files, **made_of)
 
         def compute() -> tuple[Images, dict[str, Any]]:
@@ -274,16 +266,14 @@ class Steps:
             found = segment_vessels(
                 self._ct, lungs.mask, _airways(airway), large_radius_mm=radius_mm, progress=self._tell
             )
-            masks = {"vessels": found.large, "all_vessels": found.mask}
+            grid, masks = self._folder.grid, {"vessels": found.large, "all_vessels": found.mask}
             for name, mask in masks.items():
                 source = self._source_mask(name)
-                masks[name] = (
-                    without_nodule(mask, nodule, self._folder.grid) if source is None else source & ~nodule
-                )
+                masks[name] = without_nodule(mask, nodule, grid) if source is None else source & ~nodule
             masks["all_vessels"] |= masks["vessels"]
             response = np.where(found.mask & ~masks["all_vessels"], np.float32(0.0), found.vesselness)
             images = {"vesselness": response, **masks}
-            warnings = [*found.warnings, *stout_warnings(masks["vessels"], lungs.mask, self._folder.grid)]
+            warnings = [*found.warnings, *stout_warnings(masks["vessels"], lungs.mask, grid)]
             return images, {"threshold": float(found.threshold), "warnings": warnings}
 
         return self._bring_up_to_date("vessels", names, key, compute)[0]
@@ -306,10 +296,8 @@ class Steps:
                 return lobes_given(given["lobes"], given.get("fissures"), lungs), {}
             self._tell("lobes and fissures")
             parts = (self._ct, lungs, _airways(airway), vessels["all_vessels"])
-            if "lobes" in given:
-                found = confirmed_lobes(*parts, given["lobes"])
-            else:
-                found = segment_lobes(*parts, tree)
+            own = given.get("lobes")
+            found = segment_lobes(*parts, tree) if own is None else confirmed_lobes(*parts, own)
             images = {"lobes": found.lobes, "fissures": found.fissures, **given}
             return images, {"seen": dict(found.seen), "warnings": list(found.warnings)}
 
@@ -339,13 +327,10 @@ class Steps:
         self, step: str, *, sources: tuple[str, ...] = (), of: tuple[str, ...] = (), **others: Any
     ) -> str:
         """Return the key of a step: its settings, the images before it, and what replaces its own."""
+        given = {name: self._sources[name] for name in sources if name in self._sources}
         replaced = {
-            name: [
-                folders.digest_of(self._sources[name].array),
-                folders.grid_digest(self._sources[name].grid),
-            ]
-            for name in sources
-            if name in self._sources
+            name: [folders.digest_of(each.array), folders.grid_digest(each.grid)]
+            for name, each in given.items()
         }
         before = {name: self._digests[name] for name in of}
         place = folders.grid_digest(self._folder.grid)

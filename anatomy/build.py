@@ -134,7 +134,13 @@ def build_lung(
     warnings = list(images.warnings)
     if images.fissures is None:
         warnings.append(f"Fissures are not checked: {FISSURES_UNKNOWN}.")
-    _require_tissue(images)
+    for name, volume in (("lung", images.lung), ("airway lumen", images.lumen)):
+        if not volume.array.any():
+            raise AnatomyError(
+                f"The {name} mask of {images.name} is empty",
+                expected="at least one voxel",
+                remedy="Check that the file holds the structure and was written with labels above 0",
+            )
     tell("airway tree")
     lumen = images.lumen
     tree: AirwayTree = reused.get("tree", (lumen.array,), lambda: tree_from_mask(lumen))
@@ -154,6 +160,7 @@ def build_lung(
         motion = replace(motion, nodes=keep("motion.nodes", motion.nodes))
     taken: dict[str, Any] = {name: _cut_volume(images, name, box, keep, reused) for name in CUT}
     taken |= {name: getattr(images, name) for name in AS_READ}
+    depth: DistanceField = reused.get("lumen_depth", (lumen.array,), lambda: _depth_of(lumen))
     return Lung(
         **taken,
         key=key or lung_key(images.sources),
@@ -162,7 +169,7 @@ def build_lung(
         fields=clearance_fields(
             labels, box.grid, fissures=images.fissures is not None, keep=keep, tell=tell, reused=reused
         ),
-        lumen_depth=_lumen_depth(lumen, keep, reused),
+        lumen_depth=replace(depth, corners=keep("lumen_depth.corners", depth.corners)),
         tree=tree,
         motion=motion,
         breath_hold=images.breath_hold,
@@ -170,16 +177,6 @@ def build_lung(
         warnings=(*warnings, *warnings_of_findings(findings)),
         findings=findings,
     )
-
-
-def _require_tissue(images: PatientImages) -> None:
-    for name, volume in (("lung", images.lung), ("airway lumen", images.lumen)):
-        if not volume.array.any():
-            raise AnatomyError(
-                f"The {name} mask of {images.name} is empty",
-                expected="at least one voxel",
-                remedy="Check that the file holds the structure and was written with labels above 0",
-            )
 
 
 def _labels(
@@ -206,7 +203,16 @@ def _labels(
     sides: tuple[Int32, tuple[int, ...]] | None = reused.get(
         "sides", (tissue,), lambda: coarse_sides(tissue, box.grid)
     )
-    labels[_septum(sides, tissue, warnings)] |= structures.OUTSIDE
+    if sides is None:
+        warnings.append("The mask could not be split into two lungs: taken as one lung.")
+    else:
+        septum = border_of(*sides, tissue)
+        count = int(septum.sum())
+        if count:
+            warnings.append(
+                f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
+            )
+        labels[septum] |= structures.OUTSIDE
     labels[vessels] |= structures.VESSEL
     if images.fissures is not None:
         fissures = box.cut(images.fissures.array)
@@ -223,20 +229,6 @@ def _labels(
     labels[at] |= codes
     empty = np.zeros((0, 3))
     return labels, (empty, empty) if sides is None else points_of_sides(*sides, box.grid)
-
-
-def _septum(sides: tuple[Int32, tuple[int, ...]] | None, tissue: Mask, warnings: list[str]) -> Mask:
-    """Return the border between the lungs, empty with a warning if they cannot be told apart."""
-    if sides is None:
-        warnings.append("The mask could not be split into two lungs: taken as one lung.")
-        return np.zeros(tissue.shape, dtype=bool)
-    border = border_of(*sides, tissue)
-    count = int(border.sum())
-    if count:
-        warnings.append(
-            f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
-        )
-    return border
 
 
 def _airway_codes(airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> tuple[tuple[Int, ...], UInt16]:
@@ -306,14 +298,8 @@ def _field_arrays(
         yield "obstacle_fissure", np.minimum(union, corners)
 
 
-def _lumen_depth(lumen: Volume, keep: Keep, reused: Reused) -> DistanceField:
-    """Make the field of the depth inside the lumen, on the lumen's own box."""
-    field: DistanceField = reused.get("lumen_depth", (lumen.array,), lambda: _depth_of(lumen))
-    stored = keep("lumen_depth.corners", field.corners)
-    return DistanceField(name=field.name, corners=stored, geometry=field.geometry)
-
-
 def _depth_of(lumen: Volume) -> DistanceField:
+    """Make the field of the depth inside the lumen, on the lumen's own box."""
     low, high = bounds(lumen.array)
     grid = lumen.grid.crop(low - 1, high + 1)
     solid = np.ones(grid.shape, dtype=bool, order="F")

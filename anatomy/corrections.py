@@ -55,7 +55,11 @@ def with_corrections(
         if not np.array_equal(mask, before[role])
     }
     if images.nodule_labels is not None:
-        made["nodule_labels"] = _labelled(images.nodule_labels, box, after["nodules"], values == NODULE)
+        # What was painted and has no number is the next nodule.
+        labels = images.nodule_labels
+        numbers = np.where(after["nodules"], labels.array[box], 0).astype(labels.array.dtype)
+        numbers[(values == NODULE) & (numbers == 0)] = int(labels.array.max()) + 1
+        made["nodule_labels"] = _with_part(labels, box, numbers, labels.grid)
     if images.cost is not None:
         cost = images.cost.array[box].copy()
         opened = changed & np.isinf(cost) & ~after["vessels"] & ~after["lumen"]
@@ -84,16 +88,13 @@ def _placed(corrections: Volume, grid: Grid) -> tuple[Window, Array] | None:
 
 def _part(images: PatientImages, role: str, box: Window) -> Mask:
     volume: Volume | None = getattr(images, role)
-    shape = tuple(axis.stop - axis.start for axis in box)
-    return (
-        np.zeros(shape, dtype=np.bool_) if volume is None else np.asarray(volume.array[box], dtype=np.bool_)
-    )
+    if volume is None:
+        return np.zeros([axis.stop - axis.start for axis in box], dtype=np.bool_)
+    return np.asarray(volume.array[box], dtype=np.bool_)
 
 
 def _with_part(volume: Volume | None, box: Window, part: Array, grid: Grid) -> Volume:
-    array = (
-        np.zeros(grid.shape, dtype=part.dtype, order="F") if volume is None else volume.array.copy(order="F")
-    )
+    array = np.zeros(grid.shape, dtype=part.dtype, order="F") if volume is None else volume.array.copy("F")
     array[box] = part
     return Volume(grid=grid, array=array)
 
@@ -119,22 +120,16 @@ def _wall(wall: Mask, before: Mask, after: Mask, changed: Mask, grid: Grid) -> M
     return wall & ~after
 
 
-def _labelled(labels: Volume, box: Window, nodules: Mask, painted: Mask) -> Volume:
-    """Return the numbers of nodules, with the next one for what was painted and has none."""
-    numbers = np.where(nodules, labels.array[box], 0).astype(labels.array.dtype)
-    numbers[painted & (numbers == 0)] = int(labels.array.max()) + 1
-    return _with_part(labels, box, numbers, labels.grid)
-
-
 def _warnings(grid: Grid, before: Mapping[str, Mask], after: Mapping[str, Mask]) -> list[str]:
     words = []
     for name, role in ROLES.items():
         if role not in after:
             continue
         more, less = after[role] & ~before[role], before[role] & ~after[role]
-        sizes = [np.count_nonzero(each) * grid.voxel_volume_mm3 / 1000.0 for each in (more, less)]
         said = [
-            f"{size:.2f} ml {what}" for size, what in zip(sizes, ("added", "erased"), strict=True) if size
+            f"{np.count_nonzero(each) * grid.voxel_volume_mm3 / 1000.0:.2f} ml {what}"
+            for each, what in ((more, "added"), (less, "erased"))
+            if each.any()
         ]
         words += [f"{name} {' and '.join(said)}"] if said else []
     return [f"A person corrected the masks by hand: {'; '.join(words)}."] if words else []

@@ -121,16 +121,13 @@ def kept(lung: "Organ", name: str, version: int, make: Callable[[], Any]) -> Any
     path = lung.folder / f"{name}.json"
     try:
         stored = json.loads(path.read_text(encoding="ascii"))
-        current = stored["version"] == version
-        if current and stored["checksum"] == _seal_of(lung, name, stored["values"]):
-            return stored["values"]
-        damaged = current
-    except FileNotFoundError:
-        damaged = False
-    except DAMAGE:
-        damaged = True
-    if damaged:
-        warn_of_damage(path)
+        if stored["version"] == version:
+            if stored["checksum"] == _seal_of(lung, name, stored["values"]):
+                return stored["values"]
+            warn_of_damage(path)
+    except DAMAGE as error:
+        if not isinstance(error, FileNotFoundError):
+            warn_of_damage(path)
     plain = json.loads(json.dumps(values := make()))
     # A cache may be read-only, and another process may just have removed the lung.
     with contextlib.suppress(FileError):

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from anatomy.airway_tree import AirwayTree, PieceLeftOut
+from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.base.words import percent
 from anatomy.display import point
@@ -183,10 +183,8 @@ def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, fl
     near = grown_by_one(np.asfortranarray(lung[box]))
     touches = np.bincount(part, weights=near[tuple((voxels - [axis.start for axis in box]).T)]) > 0
     yield "nodules_at_lungs", float(touches[part].mean())
-    yield (
-        "nodules_beyond_lungs_mm",
-        float(distance_mm(~lung[box], grid.spacing_mm)[nodules[box]].max(initial=0.0)),
-    )
+    beyond_mm = distance_mm(~lung[box], grid.spacing_mm)[nodules[box]]
+    yield "nodules_beyond_lungs_mm", float(beyond_mm.max(initial=0.0))
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
     yield "nodule_end", max(_flattest(voxels[:, axis], part) for axis in range(3))
@@ -219,20 +217,16 @@ def _cut_off(images: PatientImages, tree: AirwayTree) -> Iterator[Finding]:
         share = piece.voxels / whole
         if share < LEAST_CUT:
             continue
+        # The lobe, or else the lung, in which the middle of the piece lies.
+        behind = "left lung" if piece.middle_lps[0] > tree.carina_lps[0] else "right lung"
+        if images.lobes is not None:
+            lobe = int(images.grid.values_at(images.lobes.array, piece.middle_lps, 0))
+            behind = LOBES[lobe] if lobe else behind
         yield Finding(
             name="gap",
             found=f"A gap of {piece.length_mm:.1f} mm at LPS ({point(piece.position_lps)}) mm cuts off "
-            f"{percent(share)} of the airway, which leads into the {_behind(images, tree, piece)}: none of "
-            "it is used, and no path that leads through it is known",
+            f"{percent(share)} of the airway, which leads into the {behind}: none of it is used, and no "
+            "path that leads through it is known",
             remedy="Close the gap in the mask of the airway, if it is one",
             verdict=REFUSED if share >= GREATEST_CUT else DOUBTFUL,
         )
-
-
-def _behind(images: PatientImages, tree: AirwayTree, piece: PieceLeftOut) -> str:
-    """Return the lobe, or else the lung, in which the middle of a piece lies."""
-    if images.lobes is not None:
-        lobe = int(images.grid.values_at(images.lobes.array, piece.middle_lps, 0))
-        if lobe:
-            return LOBES[lobe]
-    return "left lung" if piece.middle_lps[0] > tree.carina_lps[0] else "right lung"

@@ -151,25 +151,19 @@ def _new_folder(folder: Path) -> Iterator[Path]:
             ) from error
         try:
             yield work
-            _publish(work, folder)
+            if _load(folder) is None:
+                clear_place(folder)
+                try:
+                    os.replace(work, folder)
+                except OSError:
+                    if _load(folder) is None:
+                        raise
         except OSError as error:
             raise FileError(
                 f"The lung could not be stored in {folder}: {error}",
                 remedy="Free some disk space (about 1.5 GB a patient) or choose another cache folder",
                 expected="a folder that may be written to, with room on the disk",
             ) from error
-
-
-def _publish(work: Path, folder: Path) -> None:
-    """Give a complete folder its name, unless another process was first."""
-    if _load(folder) is not None:
-        return
-    clear_place(folder)
-    try:
-        os.replace(work, folder)
-    except OSError:
-        if _load(folder) is None:
-            raise
 
 
 def _save_rest(lung: Lung, folder: Path, linked: dict[str, list[int]]) -> None:

@@ -23,7 +23,11 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
     least = _require_invertible(motion)
     moved = {side: motion.amplitude * motion.displacements_mm(lungs[side], side) for side in lungs}
     far = {side: float(np.percentile(np.linalg.norm(each, axis=1), 95)) for side, each in moved.items()}
-    down = {side: _basal_mm(lungs[side], moved[side]) for side in lungs}
+    down = {}
+    for side, places in lungs.items():
+        base, apex = places[:, 2].min(), places[:, 2].max()
+        # The third of the height next to the diaphragm, which moves most.
+        down[side] = float(-moved[side][places[:, 2] < base + (1.0 / 3.0) * (apex - base), 2].mean())
     if not all(value <= GREATEST_MM for value in far.values()):
         raise AnatomyError(
             f"The lungs move by up to {max(far.values()):.0f} mm",
@@ -71,12 +75,6 @@ def require_plausible(motion: Motion, lungs: dict[int, Float]) -> Motion:
     return replace(motion, figures=figures, warnings=tuple(warnings))
 
 
-def _basal_mm(places: Float, moved: Float) -> float:
-    base, apex = places[:, 2].min(), places[:, 2].max()
-    # The third of the height next to the diaphragm, which moves most.
-    return float(-moved[places[:, 2] < base + (1.0 / 3.0) * (apex - base), 2].mean())
-
-
 def _require_invertible(motion: Motion) -> float:
     """Return a bound, above 0, of how little of a length is left in any phase: then no two places meet."""
     least = np.stack([motion.least_stretch(side) for side in (RIGHT, LEFT)])
@@ -99,24 +97,18 @@ def _volume_factors(motion: Motion, lungs: dict[int, Float]) -> dict[str, float]
     out = {}
     for side, name in ((RIGHT, "right"), (LEFT, "left")):
         step = 0.5 * float(motion.frame[3])
-        gradient = np.stack(
-            [
-                (
-                    motion.displacements_mm(lungs[side] + step * axis, side)
-                    - motion.displacements_mm(lungs[side] - step * axis, side)
-                )
-                / (2.0 * step)
-                for axis in np.eye(3)
-            ],
-            axis=-1,
+        ahead, behind = (
+            np.stack([motion.displacements_mm(lungs[side] + by * axis, side) for axis in np.eye(3)], axis=-1)
+            for by in (step, -step)
         )
+        gradient = (ahead - behind) / (2.0 * step)
         volumes = [np.linalg.det(np.eye(3) + motion.share(phase) * gradient).mean() for phase in (0.0, 1.0)]
         out[f"{name}_volume_factor"] = float(volumes[1] / volumes[0])
     return out
 
 
 SAMPLE_MM = 4.0
-"""Distance of the places that are compared: a lung has some fifty thousand."""
+"""Distance of the places in the lungs at which a motion is looked at: a lung has some fifty thousand."""
 LEAST_DICE = 0.8
 """Less is a border that is 5 mm off everywhere: what breathing itself moves the middle of a lung by."""
 
@@ -148,10 +140,8 @@ def require_onto_lungs(motion: Motion, labels: Labels, grid: Grid, other: Volume
             f"end of the breath, phase {phase:g}",
         )
     # The mean distance from the border of each mask to that of the other, mm.
-    borders = [
-        mask & ~ndimage.binary_erosion(mask)
-        for mask in (moved.reshape(lattice.shape), there.reshape(lattice.shape))
-    ]
+    masks = (moved.reshape(lattice.shape), there.reshape(lattice.shape))
+    borders = [mask & ~ndimage.binary_erosion(mask) for mask in masks]
     away = [ndimage.distance_transform_edt(~border, sampling=SAMPLE_MM) for border in borders]
     both = np.concatenate([away[1][borders[0]], away[0][borders[1]]])
     return {"lungs_dice": dice, "lungs_dice_unmoved": unmoved, "lungs_borders_mm": float(both.mean())}

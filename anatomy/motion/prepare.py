@@ -12,7 +12,7 @@ from anatomy.base.typed import Bool, Float, Labels, Mask
 from anatomy.base.words import percent
 from anatomy.grid import Grid
 from anatomy.motion.motion import LEFT, RIGHT, Motion, cell_bounds
-from anatomy.motion.plausible import require_onto_lungs, require_plausible
+from anatomy.motion.plausible import SAMPLE_MM, require_onto_lungs, require_plausible
 from anatomy.motion.source import POPULATION_ERROR_MM, MotionSource, shares_of_motion
 from anatomy.structures import OUTSIDE
 
@@ -20,8 +20,6 @@ NODE_MM = 5.0
 """Distance of nodes: motion varies over centimetres, and its bounds are tighter the smaller the cells."""
 BORDER_MM = 20.0
 """Nodes around the lungs, so that what lies near the pleura has cells on all sides."""
-SAMPLE_MM = 4.0
-"""Distance of the places in the lungs at which a motion is looked at."""
 SIDES = {RIGHT: "right", LEFT: "left"}
 
 At = Callable[[Float], Float]
@@ -54,7 +52,12 @@ def prepare_motion(source: MotionSource, labels: Labels, grid: Grid, middle_x_mm
     elif source.exhale_lps is not None and source.inhale_lps is not None:
         nodes, figures = _of_landmarks(source, nodes_grid, at, labels, grid, middle_x_mm)
     else:
-        nodes, figures = _of_population(source, at, lungs)
+        # Each height of a lung moves to the feet as ten others do.
+        nodes, figures = np.zeros((2, *at.shape)), {"residual_mm": POPULATION_ERROR_MM}
+        for side, held in lungs.items():
+            apex, base = held[:, 2].max(), held[:, 2].min()
+            height = (apex - at[:, 2]) / max(apex - base, NODE_MM)
+            nodes[side, :, 2] = -float(source.population_motion_mm or 0.0) * shares_of_motion(height)
     motion = Motion(
         grid=nodes_grid,
         nodes=nodes.reshape(2, *nodes_grid.shape, 3),
@@ -81,9 +84,10 @@ def _of_landmarks(
     vectors = inhale - exhale
     points = exhale + source.masks_phase * vectors
     is_left = points[:, 0] > middle_x_mm
-    fits: dict[int, Fitted] = {}
-    for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left)):
-        fits[side] = fit_landmarks(points[chosen], vectors[chosen], SIDES[side])
+    fits = {
+        side: fit_landmarks(points[chosen], vectors[chosen], SIDES[side])
+        for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left))
+    }
     left_out = np.concatenate([fit.left_out_mm for fit in fits.values()])
     figures = {
         "landmark_pairs": float(len(points)),
@@ -100,18 +104,6 @@ def _of_landmarks(
     return nodes, figures
 
 
-def _of_population(
-    source: MotionSource, at: Float, lungs: dict[int, Float]
-) -> tuple[Float, dict[str, float]]:
-    """Move each height of a lung to the feet as ten others do."""
-    nodes = np.zeros((2, *at.shape))
-    for side, places in lungs.items():
-        apex, base = places[:, 2].max(), places[:, 2].min()
-        height = (apex - at[:, 2]) / max(apex - base, NODE_MM)
-        nodes[side, :, 2] = -float(source.population_motion_mm or 0.0) * shares_of_motion(height)
-    return nodes, {"residual_mm": POPULATION_ERROR_MM}
-
-
 def _of_field(
     source: MotionSource,
     nodes_grid: Grid,
@@ -122,7 +114,16 @@ def _of_field(
     middle_x_mm: float,
 ) -> tuple[Float, dict[str, float]]:
     """Bring a field to the masks' phase, and continue that of each lung beyond it."""
-    _require_covered(source, np.concatenate(list(lungs.values())))
+    covered = 0.0
+    if source.grid is not None:
+        covered = float(source.grid.contains(np.concatenate(list(lungs.values()))).mean())
+    # Share of the lungs that a field must cover: a field in a wrong frame covers far less.
+    if not covered >= 0.99:
+        raise FrameError(
+            f"The {source.description} covers {percent(covered)} of the lungs",
+            expected="a field over both lungs, LPS mm of the masks",
+            remedy="Export the field on the whole image; check that it and the masks come from the same one",
+        )
     source = _filled(source)
     own, smooth = _field_at(source, 0.0), _field_at(source, NODE_MM)
     d, rest_mm = _at_masks(source, smooth, at)
@@ -149,17 +150,6 @@ def _of_field(
         "mended_share": max(mended),
         "sliding_at_pleura_mm": _sliding(labels, grid, exact_of),
     }
-
-
-def _require_covered(source: MotionSource, places: Float) -> None:
-    covered = 0.0 if source.grid is None else float(source.grid.contains(places).mean())
-    # Share of the lungs that a field must cover: a field in a wrong frame covers far less.
-    if not covered >= 0.99:
-        raise FrameError(
-            f"The {source.description} covers {percent(covered)} of the lungs",
-            expected="a field over both lungs, LPS mm of the masks",
-            remedy="Export the field on the whole image; check that it and the masks come from the same one",
-        )
 
 
 def _filled(source: MotionSource) -> MotionSource:
@@ -268,16 +258,10 @@ def continued(values: Float, known: Mask) -> Float:
     for _ in range(60):
         mean = np.zeros_like(out)
         for axis in range(3):
-            for beside in (_shifted(out, axis, 1), _shifted(out, axis, -1)):
-                mean += beside
+            for by in (1, -1):  # The neighbours of a node at the border are itself there.
+                mean += np.take(out, np.arange(out.shape[axis]) + by, axis=axis, mode="clip")
         out = np.where(known[..., None], values, mean / 6.0)
     return np.asarray(out)
-
-
-def _shifted(values: Float, axis: int, by: int) -> Float:
-    """Return the neighbours of all nodes along an axis, those of the border being themselves."""
-    index = np.clip(np.arange(values.shape[axis]) + by, 0, values.shape[axis] - 1)
-    return np.asarray(np.take(values, index, axis=axis))
 
 
 SMOOTHINGS = (1e2, 1e3, 1e4, 1e5)

@@ -118,9 +118,8 @@ class Centerlines:
     def generation(self) -> Int:
         """Number of branchings from the root, `(B,)`; the root has 0."""
         generation = np.zeros(self.n_branches, dtype=np.int64)
-        for branch, parent in enumerate(self.branch_parent):
-            if parent >= 0:
-                generation[branch] = generation[parent] + 1
+        for branch in range(1, self.n_branches):
+            generation[branch] = generation[self.branch_parent[branch]] + 1
         return generation
 
     @property
@@ -135,9 +134,7 @@ class Centerlines:
     @property
     def strahler_order(self) -> Int:
         """Strahler order `(B,)`: 1 at the tips, one more only where two of the highest order meet."""
-        highest = np.zeros(self.n_branches, dtype=np.int64)
-        order = np.ones(self.n_branches, dtype=np.int64)
-        ties = np.zeros(self.n_branches, dtype=np.int64)
+        order, highest, ties = (np.full(self.n_branches, n, dtype=np.int64) for n in (1, 0, 0))
         for branch in range(self.n_branches - 1, -1, -1):
             if highest[branch]:
                 order[branch] = highest[branch] + (ties[branch] > 1)

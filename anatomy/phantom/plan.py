@@ -121,20 +121,6 @@ def _share_out(cloud: Float, starts: Float, directions: Float) -> Int:
     return np.asarray(owner)
 
 
-def _segment_clouds(
-    ends: dict[str, tuple[Float, Float]], territory: Territory, resected: int
-) -> dict[str, Float]:
-    clouds: dict[str, Float] = {}
-    for lobe in sorted(set(LOBES.values()) - {resected}):
-        segments = [b for b in TEMPLATE if b.segment and b.lobe == lobe]
-        cloud = territory.points_lps[territory.lobe_of_point == lobe]
-        starts = np.array([ends[b.name][0] for b in segments])
-        directions = unit(np.array([ends[b.name][1] for b in segments]) - starts)
-        owner = _share_out(cloud, starts, directions)
-        clouds.update({b.name: cloud[owner == i] for i, b in enumerate(segments)})
-    return clouds
-
-
 def grow_airways(
     territory: Territory, scale: float, rng: np.random.Generator, traits: Traits = PLAIN
 ) -> tuple[Sprouts, GrowthRule]:
@@ -145,7 +131,13 @@ def grow_airways(
     """
     ends = _skeleton(scale, rng, traits.bronchus_length)
     resected = traits.resected_lobe
-    clouds = _segment_clouds(ends, territory, resected)
+    clouds: dict[str, Float] = {}
+    for lobe in sorted(set(LOBES.values()) - {resected}):
+        segments = [b for b in TEMPLATE if b.segment and b.lobe == lobe]
+        cloud = territory.points_lps[territory.lobe_of_point == lobe]
+        starts = np.array([ends[b.name][0] for b in segments])
+        owner = _share_out(cloud, starts, unit(np.array([ends[b.name][1] for b in segments]) - starts))
+        clouds |= {b.name: cloud[owner == i] for i, b in enumerate(segments)}
     counts = {name: len(cloud) for name, cloud in clouds.items()}  # The points that each bronchus supplies.
     for bronchus in reversed(TEMPLATE):
         counts[bronchus.parent] = counts.get(bronchus.parent, 0) + counts.get(bronchus.name, 0)

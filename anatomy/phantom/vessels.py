@@ -57,18 +57,6 @@ class Obstacles:
         return distance_mm
 
 
-def _plane_normal(airways: Sprouts, branch: int, below: list[int], reference: Float) -> Float:
-    """Return the unit vector from airway to artery at a branch's end, nearest `reference`, across the
-    children's plane."""
-    if len(below) >= 2:
-        normal = np.cross(airways.direction(below[0]), airways.direction(below[1]))
-    else:
-        tangent = unit(airways.points[branch][-1] - airways.points[branch][-2])
-        normal = reference - (reference @ tangent) * tangent
-    normal = normal if np.linalg.norm(normal) > 1e-6 else reference
-    return np.asarray(unit(normal) * (-1 if normal @ reference < 0 else 1))
-
-
 def _beside(line: Float, start_offset: Float, end_offset: Float) -> Float:
     """Return `line` `(K, 3)` shifted sideways, from the first offset vector to the last, never nearer."""
     t = np.linspace(0, 1, len(line))[:, None]
@@ -102,7 +90,15 @@ def copy_arteries(airways: Sprouts, outer_radius_mm: Float, radius_mm: Float, sc
     for branch, line in enumerate(airways.points):
         parent = airways.parent[branch]
         reference = side[branch] if branch in CENTRAL_KNOTS else side[parent]
-        side[branch] = _plane_normal(airways, branch, children[branch], reference)
+        # From the airway to the artery at its end, nearest the reference, across the children's plane.
+        below = children[branch]
+        if len(below) >= 2:
+            normal = np.cross(airways.direction(below[0]), airways.direction(below[1]))
+        else:
+            tangent = unit(line[-1] - line[-2])
+            normal = reference - (reference @ tangent) * tangent
+        normal = normal if np.linalg.norm(normal) > 1e-6 else reference
+        side[branch] = unit(normal) * (-1 if normal @ reference < 0 else 1)
         if branch in CENTRAL_KNOTS:
             knots = scale * np.array(CENTRAL_KNOTS[branch])
             goal = line[-1] + side[branch] * distance[branch]

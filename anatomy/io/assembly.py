@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Mask, UInt8
+from anatomy.base.typed import Mask
 from anatomy.grid import Grid, Volume
 from anatomy.io.mask_values import require_label_values
 from anatomy.io.masks import MaskSet, place
@@ -33,7 +33,16 @@ def with_lobes(masks: MaskSet) -> MaskSet:
     known = dict(masks.masks)
     statements = list(masks.statements)
     are_the_lungs = "lung" not in known
-    main = _main_lobes(masks.lobes, statements)
+    main = np.zeros_like(masks.lobes)
+    for number, name in LOBES.items():
+        lobe = masks.lobes == number
+        kept = main_pieces(lobe)
+        main[kept] = number
+        stray = int(np.count_nonzero(lobe)) - int(np.count_nonzero(kept))
+        if stray:
+            statements.append(
+                f"{stray} voxels of the mask of the {name} lie apart from it: they are lung, but of no lobe."
+            )
     union = masks.lobes > 0 if are_the_lungs else known["lung"] | (masks.lobes > 0)
     masks = replace(masks, masks={**known, "lung": union})
     known = dict((fill_lung(masks) if are_the_lungs else masks).masks)
@@ -50,21 +59,6 @@ def with_lobes(masks: MaskSet) -> MaskSet:
                 "lobes of the same lung are taken as fissures."
             )
     return replace(masks, masks=known, lobes=lobes, statements=tuple(statements))
-
-
-def _main_lobes(lobes: UInt8, statements: list[str]) -> UInt8:
-    """Return the lobes without the pieces apart from them, which stay lung."""
-    kept = np.zeros_like(lobes)
-    for number, name in LOBES.items():
-        lobe = lobes == number
-        main = main_pieces(lobe)
-        kept[main] = number
-        stray = int(np.count_nonzero(lobe)) - int(np.count_nonzero(main))
-        if stray:
-            statements.append(
-                f"{stray} voxels of the mask of the {name} lie apart from it: they are lung, but of no lobe."
-            )
-    return kept
 
 
 def fill_lung(masks: MaskSet) -> MaskSet:
@@ -113,6 +107,11 @@ def with_contents(masks: MaskSet) -> MaskSet:
 
 LUNG_ROLES: Mapping[str, str] = {"lumen": "the airway lumen", "vessels": "the vessels", "lung": "the lungs"}
 """Masks that a lung cannot be without, and what messages call them."""
+DESCRIBE_YOURSELF = (
+    "Rename the files, or write a file patient.toml beside them that names them: "
+    'lumen = "airway.nii.gz", vessels = "vessels.nii.gz", lung = "lungs.nii.gz" (a line each)'
+)
+"""The remedy for a folder whose files are not known by their names."""
 
 
 def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any) -> PatientImages:
@@ -128,7 +127,7 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
         raise AnatomyError(
             f"{where} holds no mask of {', '.join(missing)}",
             expected="masks of the airway lumen, the vessels and the lungs (or their five lobes)",
-            remedy=describe_yourself(),
+            remedy=DESCRIBE_YOURSELF,
         )
     volumes, empty = volumes_of(masks)
     known: dict[str, Any] = dict(volumes)
@@ -147,14 +146,6 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
     )
 
 
-def describe_yourself() -> str:
-    """Return the remedy for a folder whose files are not known by their names."""
-    return (
-        "Rename the files, or write a file patient.toml beside them that names them: "
-        'lumen = "airway.nii.gz", vessels = "vessels.nii.gz", lung = "lungs.nii.gz" (a line each)'
-    )
-
-
 def volumes_of(masks: MaskSet) -> tuple[dict[str, Volume], list[str]]:
     """Return the masks that are not empty as volumes, and a warning for each that is.
 
@@ -165,21 +156,17 @@ def volumes_of(masks: MaskSet) -> tuple[dict[str, Volume], list[str]]:
     for role, mask in masks.masks.items():
         if mask.any():
             volumes[role] = Volume(grid=masks.grid, array=mask)
-        else:
-            warnings.append(_empty(role, masks))
+            continue
+        own = masks.files.get(role, ())
+        if role not in ("fissures", "nodules"):
+            outside = [said for said in masks.statements if any(said.startswith(file) for file in own)]
+            raise AnatomyError(
+                " ".join([f"The mask of {role} is empty ({', '.join(own)}).", *outside]),
+                expected="at least one voxel that is not zero",
+                remedy="Segment the structure again, or remove the file if the structure is unknown",
+            )
+        warnings.append(f"The mask of {role} ({', '.join(own)}) is empty; it is taken as absent")
     return volumes, warnings
-
-
-def _empty(role: str, masks: MaskSet) -> str:
-    own = masks.files.get(role, ())
-    if role in ("fissures", "nodules"):
-        return f"The mask of {role} ({', '.join(own)}) is empty; it is taken as absent"
-    outside = [said for said in masks.statements if any(said.startswith(file) for file in own)]
-    raise AnatomyError(
-        " ".join([f"The mask of {role} is empty ({', '.join(own)}).", *outside]),
-        expected="at least one voxel that is not zero",
-        remedy="Segment the structure again, or remove the file if the structure is unknown",
-    )
 
 
 def require_cost(volume: Volume, grid: Grid) -> Volume:

@@ -155,12 +155,10 @@ def read_markups(path: str | Path) -> tuple[Markup, ...]:
 def _of_bundle(path: Path) -> tuple[Markup, ...]:
     with reading(path), zipfile.ZipFile(path) as bundle:
         members = {each.filename: each for each in bundle.infolist()}
-        scenes = sorted(
-            (name for name in members if name.endswith(".mrml")), key=lambda name: name.count("/")
-        )
+        scenes = [name for name in members if name.endswith(".mrml")]
         if not scenes:
             raise FileError(f"{path} holds no scene", expected="a .mrml in the bundle", remedy=_REMEDY)
-        folder = scenes[0].rpartition("/")[0]
+        folder, _, scene = min(scenes, key=lambda name: name.count("/")).rpartition("/")
 
         def text(name: str) -> str:
             member = f"{folder}/{name}" if folder else name
@@ -176,7 +174,7 @@ def _of_bundle(path: Path) -> tuple[Markup, ...]:
                 )
             return content.decode("utf-8")
 
-        return _of_scene(text(scenes[0].rpartition("/")[2]), text, path)
+        return _of_scene(text(scene), text, path)
 
 
 def _of_scene(text: str, read: Callable[[str], str | None], path: Path) -> tuple[Markup, ...]:
@@ -192,15 +190,21 @@ def _of_scene(text: str, read: Callable[[str], str | None], path: Path) -> tuple
     by_id = {node.get("id", ""): node for node in nodes}
     markups: list[Markup] = []
     for node in nodes:
-        references = dict(
-            each.split(":", 1) for each in (node.get("references") or "").split(";") if ":" in each
-        )
+        stated = (node.get("references") or "").split(";")
+        references = dict(each.split(":", 1) for each in stated if ":" in each)
         storage = by_id.get(references.get("storage", "").split(" ")[0])
         file = "" if storage is None else unquote(storage.get("fileName") or "")
         if not node.tag.startswith("Markups") or not file.endswith(".json"):
             continue
-        transform = references.get("transform")
-        _require_still(node, by_id.get(transform or ""), transform, path)
+        if transform := references.get("transform"):
+            moving = by_id.get(transform)
+            name = "" if moving is None else moving.get("name", "")
+            if name not in MASKS_TRANSFORMS:
+                raise FrameError(
+                    f"{node.get('name')!r} in {path} lies below the transform {name or transform!r}",
+                    expected="points that are stored where they are shown",
+                    remedy="Harden the transform in 3D Slicer's Data module, and save the scene again",
+                )
         if file not in lists:
             content = read(file)
             lists[file] = [] if content is None else _of_file(content, path.parent / file)
@@ -209,21 +213,6 @@ def _of_scene(text: str, read: Callable[[str], str | None], path: Path) -> tuple
             for each in lists[file]
         ]
     return tuple(markups)
-
-
-def _require_still(
-    node: ElementTree.Element, transform: ElementTree.Element | None, stated: str | None, path: Path
-) -> None:
-    """Raise FrameError if a transform moves a markup that is not stored in the masks' phase."""
-    if not stated:
-        return
-    name = "" if transform is None else transform.get("name", "")
-    if name not in MASKS_TRANSFORMS:
-        raise FrameError(
-            f"{node.get('name')!r} in {path} lies below the transform {name or stated!r}",
-            expected="points that are stored where they are shown",
-            remedy="Harden the transform in 3D Slicer's Data module, and save the scene again",
-        )
 
 
 def _of_file(text: str, path: Path) -> list[Markup]:
@@ -253,9 +242,8 @@ def _point(content: dict[str, Any], lps_from_frame: Float, path: Path) -> Contro
     place = np.array(content["position"], dtype=np.float64)
     turn = content.get("orientation")
     rotation = lps_from_frame if turn is None else np.array(turn, dtype=np.float64).reshape(3, 3)
-    if place.shape != (3,) or not (
-        (np.abs(place) <= MOST_COORDINATE_MM).all() and np.isfinite(rotation).all()
-    ):
+    near = (np.abs(place) <= MOST_COORDINATE_MM).all()
+    if place.shape != (3,) or not near or not np.isfinite(rotation).all():
         raise FileError(
             f"The point {label!r} of {path} is not three finite numbers", expected="mm", remedy=_REMEDY
         )

@@ -52,7 +52,10 @@ def mask_of(
         return _of_two(values, name, low, high)
     if low >= 0 and high <= PARTS.get(role, 0) and (found == np.rint(found)).all():
         return np.asarray(values != 0), ()
-    top = _top_of(found)
+    # The value of a whole voxel of an image of fractions; 0 if it is none.
+    top = float(high) if low >= 0 and high in TOPS[1:] and len(found) > FEW else 0.0
+    if low >= -SWING and high <= 1.0 + SWING and (found != np.rint(found)).any():
+        top = TOPS[0]
     if top:
         return _of_fractions(values, name, top, voxel_mm3)
     if (found == np.rint(found)).all() and low >= 0:
@@ -116,14 +119,6 @@ def _of_two(values: Array, name: str, low: float, high: float) -> tuple[Mask, tu
         f"{name} holds {low:g} and {high:g} alone: {mark:g} is taken as the mask, {background:g} as nothing."
     )
     return np.asarray(values == mark), (said,)
-
-
-def _top_of(found: Array) -> float:
-    """Return the value of a whole voxel of an image of fractions; 0 if it is none."""
-    low, high = float(found[0]), float(found[-1])
-    if low >= -SWING and high <= 1.0 + SWING and (found != np.rint(found)).any():
-        return TOPS[0]
-    return high if low >= 0 and high in TOPS[1:] and len(found) > FEW else 0.0
 
 
 def _of_fractions(values: Array, name: str, top: float, voxel_mm3: float) -> tuple[Mask, tuple[str, ...]]:

@@ -10,9 +10,8 @@ import numpy as np
 
 from anatomy.base.errors import AnatomyError, FrameError
 from anatomy.base.files import sha256
-from anatomy.base.typed import Float
 from anatomy.grid import Grid
-from anatomy.io.assembly import LUNG_ROLES, assemble, describe_yourself
+from anatomy.io.assembly import DESCRIBE_YOURSELF, LUNG_ROLES, assemble
 from anatomy.io.frames import Frame, read_points, read_pose
 from anatomy.io.masks import MaskSource, read_masks
 from anatomy.io.near_names import by_name, looks_like, plain, require_single
@@ -125,7 +124,15 @@ def text_poses(folder: Path, grid: Grid) -> tuple[dict[str, Any], dict[str, str]
     ]
     for what, places in (("start", [pose[:3, 3] for pose in starts]), ("target", [p for _, p in targets])):
         for place in places:
-            _require_inside(grid, place, what, folder)
+            if not grid.contains(place).all():
+                flipped = place * np.array([-1.0, -1.0, 1.0])
+                hint = "; taken as LPS it would lie inside" if grid.contains(flipped).all() else ""
+                where = ", ".join(f"{x:.1f}" for x in place)
+                raise FrameError(
+                    f"A {what} of {folder} lies outside the images, at LPS ({where}) mm{hint}",
+                    expected="positions in RAS mm inside the images",
+                    remedy="Check the frame of the text files, and that they belong to this patient",
+                )
     poses = {
         "starts": starts,
         "start_names": tuple(path.stem for path in start_files),
@@ -149,7 +156,7 @@ def require_roles(folder: Path, sources: list[MaskSource]) -> None:
             f"{folder} holds some masks of lungs, but no mask of {words}. "
             f"{missing_files(folder, missing, sources)}",
             expected=f"{files}; instead of pleuralBoundary also the lobes LUL, LLL, RUL, RML, RLL",
-            remedy=describe_yourself(),
+            remedy=DESCRIBE_YOURSELF,
         )
 
 
@@ -157,22 +164,9 @@ def missing_files(folder: Path, missing: list[str], sources: list[MaskSource]) -
     """Say of each missing role which image of the folder looks like it, and what else is there."""
     used = {source.path for source in sources}
     unused = {name: path for name, path in by_name(folder).items() if path not in used}
-    sentences = []
-    for role in missing:
-        like = looks_like(LUNG_FILES[role], unused)
-        if like is not None:
-            sentences.append(f"{like.name} looks like {LUNG_FILES[role][0]}.nii.gz")
+    alike = {role: looks_like(LUNG_FILES[role], unused) for role in missing}
+    sentences = [
+        f"{file.name} looks like {LUNG_FILES[role][0]}.nii.gz" for role, file in alike.items() if file
+    ]
     there = ", ".join(path.name for path in unused.values())
     return "; ".join([*sentences, f"images of unknown name: {there or 'none'}"])
-
-
-def _require_inside(grid: Grid, point: Float, what: str, folder: Path) -> None:
-    if not grid.contains(point).all():
-        flipped = point * np.array([-1.0, -1.0, 1.0])
-        hint = "; taken as LPS it would lie inside" if grid.contains(flipped).all() else ""
-        place = ", ".join(f"{x:.1f}" for x in point)
-        raise FrameError(
-            f"A {what} of {folder} lies outside the images, at LPS ({place}) mm{hint}",
-            expected="positions in RAS mm inside the images",
-            remedy="Check the frame of the text files, and that they belong to this patient",
-        )

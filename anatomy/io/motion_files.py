@@ -125,7 +125,13 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
         return MotionSource(description=words, grid=grid, vectors=vectors, **common)
     path = require_file(folder / keys.file)
     if path.suffix.lower() == LANDMARKS:
-        exhale_lps, inhale_lps = read_landmarks(path, _require_frame(keys, path))
+        if not keys.frame:
+            raise FrameError(
+                f"[motion] of patient.toml does not state the frame of {path.name}",
+                expected='frame = "lps" or frame = "ras"',
+                remedy="3D Slicer shows RAS coordinates, DICOM and ITK use LPS",
+            )
+        exhale_lps, inhale_lps = read_landmarks(path, keys.frame)
         words = f"{len(exhale_lps)} landmark pairs of {keys.file}"
         return MotionSource(description=words, exhale_lps=exhale_lps, inhale_lps=inhale_lps, **common)
     if not keys.maps_from:
@@ -145,23 +151,13 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
     )
 
 
-def _require_frame(keys: MotionFile, path: Path) -> str:
-    if not keys.frame:
-        raise FrameError(
-            f"[motion] of patient.toml does not state the frame of {path.name}",
-            expected='frame = "lps" or frame = "ras"',
-            remedy="3D Slicer shows RAS coordinates, DICOM and ITK use LPS",
-        )
-    return keys.frame
-
-
 def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
     """Return the places `(N, 3)` LPS mm at end-exhale and at end-inhale that a CSV of six columns states.
 
     Lines that begin with a letter or # are headings.  Raises FileError if a line does not hold six finite
     numbers.
     """
-    rows = []
+    rows, lps = [], LPS_FROM[frame]
     for number, line in enumerate(read_text(path).splitlines(), 1):
         if not line.strip() or line.lstrip()[0] == "#" or line.lstrip()[0].isalpha():
             continue
@@ -177,7 +173,6 @@ def read_landmarks(path: Path, frame: str) -> tuple[Float, Float]:
             )
         rows.append(row)
     values = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    lps = LPS_FROM[frame]
     return transform_points(lps, values[:, :3]), transform_points(lps, values[:, 3:])
 
 

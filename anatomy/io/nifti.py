@@ -189,7 +189,15 @@ def _lps_from_ijk(
     if sform_code > 0:
         ras = np.vstack([np.array(fields["srow"], dtype=np.float64).reshape(3, 4), [0, 0, 0, 1]])
         if qform_code > 0:
-            _require_agreement(ras, _qform(fields, path), shape, path)
+            corners = list(product(*[(0, n - 1) for n in shape]))
+            by_qform = transform_points(_qform(fields, path), corners)
+            apart = np.abs(transform_points(ras, corners) - by_qform).max()
+            if not apart <= 1.0:
+                raise FrameError(
+                    f"{path} states two places for the same voxels: sform and qform differ by {apart:.1f} mm",
+                    expected="one place",
+                    remedy="Set the code of the wrong transform to 0 in the header",
+                )
     elif qform_code > 0:
         ras = _qform(fields, path)
     elif frame is not None:
@@ -223,17 +231,6 @@ def _qform(fields: dict[str, tuple[Any, ...]], path: Path) -> Float:
     matrix[:3, :3] = rotation * np.array([1.0, 1.0, handedness]) * _pixdim(fields, path)
     matrix[:3, 3] = offset
     return matrix
-
-
-def _require_agreement(sform: Float, qform: Float, shape: tuple[int, int, int], path: Path) -> None:
-    corners = list(product(*[(0, n - 1) for n in shape]))
-    apart = np.abs(transform_points(sform, corners) - transform_points(qform, corners)).max()
-    if not apart <= 1.0:
-        raise FrameError(
-            f"{path} states two places for the same voxels: sform and qform differ by {apart:.1f} mm",
-            expected="one place",
-            remedy="Set the code of the wrong transform to 0 in the header",
-        )
 
 
 def _labels(extension_block: bytes, order: str) -> dict[int, str]:

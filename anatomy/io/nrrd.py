@@ -69,7 +69,16 @@ def open_nrrd(
     is_first = False
     if components > 1:
         is_first = _is_first_axis(fields, sizes, path, components)
-        _require_lps_vectors(fields, path)
+        # Vectors of another frame are refused: programs turn axes to LPS, but not all of them turn vectors.
+        space = fields.get("space", "").lower()
+        measured = _vectors(fields.get("measurement frame", "(1,0,0) (0,1,0) (0,0,1)"))
+        if space not in _LPS_WORDS or measured != np.eye(3).tolist():
+            raise FrameError(
+                f"{path} states the space {space!r} and the measurement frame {measured}, in which the frame "
+                "of its vectors is not certain",
+                expected="space: left-posterior-superior, without another measurement frame",
+                remedy="Write the field with ITK, SimpleITK or 3D Slicer",
+            )
         sizes = sizes[1:] if is_first else sizes[:-1]
     shape = image_header.image_shape(sizes, dtype.itemsize * components, path, path.stat().st_size)
     grid, is_reversed = image_header.right_handed_grid(shape, _lps_from_ijk(fields, path, frame), path)
@@ -92,19 +101,6 @@ def _is_first_axis(fields: Mapping[str, str], sizes: tuple[int, ...], path: Path
         stated = f"the sizes {sizes} and the directions {' '.join(axes)[:120] or 'missing'}, not {components}"
         raise image_header.not_of_components(path, stated, components)
     return without == [0]
-
-
-def _require_lps_vectors(fields: Mapping[str, str], path: Path) -> None:
-    """Refuse vectors of another frame: programs turn axes to LPS, but not all of them turn vectors."""
-    space = fields.get("space", "").lower()
-    measured = _vectors(fields.get("measurement frame", "(1,0,0) (0,1,0) (0,0,1)"))
-    if space not in _LPS_WORDS or measured != np.eye(3).tolist():
-        raise FrameError(
-            f"{path} states the space {space!r} and the measurement frame {measured}, in which the frame of "
-            "its vectors is not certain",
-            expected="space: left-posterior-superior, without another measurement frame",
-            remedy="Write the field with ITK, SimpleITK or 3D Slicer",
-        )
 
 
 def _text(path: Path) -> tuple[dict[str, str], dict[str, str], int]:

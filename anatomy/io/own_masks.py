@@ -260,11 +260,7 @@ def _named_file(folder: Path, name: str) -> Path:
     path = folder / name
     if path.is_file():
         return path
-    there = (
-        [other.name for other in path.parent.iterdir() if image_suffix(other) and other.is_file()]
-        if path.parent.is_dir()
-        else []
-    )
+    there = [other.name for other in path.parent.glob("*") if image_suffix(other) and other.is_file()]
     if (folder / (slashed := name.replace("\\", "/"))).is_file():
         remedy = f"Write {slashed}: every system takes / between folders"
     elif unicodedata.normalize("NFC", path.name) in {unicodedata.normalize("NFC", each) for each in there}:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from anatomy.base.errors import FileError
-from anatomy.io.assembly import describe_yourself
+from anatomy.io.assembly import DESCRIBE_YOURSELF
 from anatomy.io.corrections import corrected
 from anatomy.io.ct_cases import cases_in, require_no_ct_case
 from anatomy.io.dicom_seg import is_dicom
@@ -132,7 +132,7 @@ def _refuse(folder: Path) -> NoReturn:
         f"{folder} is no patient of a known kind: it holds {there}",
         expected="a folder of Med-RAD (bronchialTree, vessels, pleuralBoundary), output of TotalSegmentator "
         "(task lung_vessels), a case of AeroPath or ATM'22, or a folder with a patient.toml",
-        remedy=describe_yourself(),
+        remedy=DESCRIBE_YOURSELF,
     )
 
 

@@ -36,13 +36,11 @@ def stored_names(path: Path) -> dict[int, str]:
     """
     names = dict(read_labels(path))
     stem = image_stem(path)
-    for sidecar in (f"{stem}.json", f"{stem}_labels.json"):
+    for sidecar in (f"{stem}.json", f"{stem}_labels.json", *(shared := ("labels.json", "dataset.json"))):
         if not names and (path.parent / sidecar).is_file():
             names = _sidecar_names(path.parent / sidecar)
-    for sidecar in ("labels.json", "dataset.json"):
-        if not names and (path.parent / sidecar).is_file():
-            shared = _sidecar_names(path.parent / sidecar)
-            names = shared if label_values(path) <= {0, *shared} else {}
+            if sidecar in shared and not label_values(path) <= {0, *names}:
+                names = {}
     return names
 
 
@@ -55,19 +53,12 @@ def label_values(path: Path) -> set[float]:
 
 
 def _sidecar_names(path: Path) -> dict[int, str]:
-    content: Any = read_json(
-        path,
-        expected="label names and values",
-        remedy="Correct the file, or take it away if it belongs to nothing here",
-    )
+    remedy = "Correct the file, or take it away if it belongs to nothing here"
+    content: Any = read_json(path, expected="label names and values", remedy=remedy)
     if isinstance(content, Mapping) and isinstance(content.get("labels"), Mapping):
         content = content["labels"]
     if not isinstance(content, Mapping):
-        raise FileError(
-            f"{path} is not a JSON object",
-            expected='{"lung_airways": 1, ...}',
-            remedy="Correct the file, or take it away if it belongs to nothing here",
-        )
+        raise FileError(f"{path} is not a JSON object", expected='{"lung_airways": 1, ...}', remedy=remedy)
     names: dict[int, str] = {}
     for key, value in content.items():
         if isinstance(value, int) and not isinstance(value, bool):

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from anatomy.io.images import SUFFIXES, read_volume, write_volume
 from anatomy.io.own_masks import DESCRIPTION
 from anatomy.io.voxels import COST_MAP_NOTE
 from anatomy.lobes import LOBES
+from anatomy.morphology import window
 from anatomy.segmentation.canonical import canonical
 
 STATE = "segmentation.json"
@@ -61,9 +63,25 @@ class SegmentationFolder:
         self.path = require_writable_folder(folder)
         self.grid = grid
         self._description, self._aside = self.path / DESCRIPTION, self.path / f".{DESCRIPTION}.aside"
-        self._refuse_inputs(inputs)
-        if not force and not (self.path / STATE).is_file():
-            self._refuse_foreign()
+        # All files that may be written here or be corrections: they are moved, or overwritten.
+        images = [f"{name}{suffix}" for name in IMAGES for suffix in SUFFIXES]
+        places = [self.path / name for name in (*images, f"cost{_MADE_SUFFIX}", DESCRIPTION)]
+        stated = {os.path.realpath(path) for path in inputs}
+        if found := [path.name for path in places if os.path.realpath(path) in stated]:
+            raise FileError(
+                f"{self.path} is to be written, and its {', '.join(found)} are inputs",
+                expected="inputs outside of the folder that is written, or under other names",
+                remedy="Choose another folder with --out; a mask that was corrected in this folder is found "
+                "without an option",
+            )
+        held = [path.name for path in places if path.is_file()]
+        if held and not force and not (self.path / STATE).is_file():
+            raise FileError(
+                f"{self.path} holds {', '.join(held)}, but no {STATE} that says a segmentation made them",
+                expected="an empty folder, or one that was segmented into before",
+                remedy="Choose another folder with --out, or say --force: masks then count as corrections, "
+                f"and {DESCRIPTION} is kept",
+            )
         self._record = _read_record(self.path / STATE)
         for left in self.path.glob(f".*-*{_MADE_SUFFIX}"):  # of a run that was killed
             left.unlink(missing_ok=True)
@@ -90,40 +108,14 @@ class SegmentationFolder:
             )
         return found[0] if found else None
 
-    def _places(self) -> list[Path]:
-        """Return all files that may be written here or be corrections: they are moved, or overwritten."""
-        images = [f"{name}{suffix}" for name in IMAGES for suffix in SUFFIXES]
-        return [self.path / name for name in (*images, f"cost{_MADE_SUFFIX}", DESCRIPTION)]
-
-    def _refuse_inputs(self, inputs: Sequence[Path]) -> None:
-        stated = {os.path.realpath(path) for path in inputs}
-        if found := [path.name for path in self._places() if os.path.realpath(path) in stated]:
-            raise FileError(
-                f"{self.path} is to be written, and its {', '.join(found)} are inputs",
-                expected="inputs outside of the folder that is written, or under other names",
-                remedy="Choose another folder with --out; a mask that was corrected in this folder is found "
-                "without an option",
-            )
-
-    def _refuse_foreign(self) -> None:
-        if found := [path.name for path in self._places() if path.is_file()]:
-            raise FileError(
-                f"{self.path} holds {', '.join(found)}, but no {STATE} that says a segmentation made them",
-                expected="an empty folder, or one that was segmented into before",
-                remedy="Choose another folder with --out, or say --force: masks then count as corrections, "
-                f"and {DESCRIPTION} is kept",
-            )
-
     def _collect_corrections(self) -> None:
         """Move images that were not written here to the corrections."""
-        for name in IMAGES:
-            for suffix in SUFFIXES:
-                path = self.path / f"{name}{suffix}"
-                if not path.is_file():
-                    continue
-                if suffix != _MADE_SUFFIX or sha256(path) not in self._entry(name).get("written", ()):
-                    require_writable_folder(self.path / FOLDER)
-                    os.replace(path, self.path / FOLDER / path.name)
+        for name, suffix in product(IMAGES, SUFFIXES):
+            path = self.path / f"{name}{suffix}"
+            made = suffix == _MADE_SUFFIX and self._entry(name).get("written", ())
+            if path.is_file() and not (made and sha256(path) in made):
+                require_writable_folder(self.path / FOLDER)
+                os.replace(path, self.path / FOLDER / path.name)
 
     def read(self, path: Path) -> Volume:
         """Read an image and put it on the grid of the CT."""
@@ -278,7 +270,5 @@ def onto_grid(volume: Volume, grid: Grid, name: str) -> Volume:
     placed = np.zeros(grid.shape, dtype=volume.array.dtype, order="F")
     low, high = np.maximum(shift, 0), np.minimum(shift + volume.grid.shape, grid.shape)
     if (low < high).all():
-        into = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        source = tuple(slice(int(a), int(b)) for a, b in zip(low - shift, high - shift, strict=True))
-        placed[into] = volume.array[source]
+        placed[window(low, high)] = volume.array[window(low - shift, high - shift)]
     return Volume(grid=grid, array=placed)

@@ -75,10 +75,8 @@ def _short(left: Mask, right: Mask, grid: Grid, carina_lps: Float) -> Iterator[s
         whole = not (left if name == "left" else right)[:, :, 0].any()
         back = (float(np.percentile(lower[:, 1], 97.0)) - carina_lps[1]) / width
         base = (carina_lps[2] - float(np.percentile(lower[:, 2], 1.0))) / width
-        for place, share, least, counts in (
-            ("back", back, LEAST_BACK, True),
-            ("base", base, LEAST_BASE, whole),
-        ):
+        ends = (("back", back, LEAST_BACK, True), ("base", base, LEAST_BASE, whole))
+        for place, share, least, counts in ends:
             if counts and share < least:
                 yield (
                     f"Lung seems to be missing at the {place} of the {name} lung, which ends "

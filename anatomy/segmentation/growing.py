@@ -233,15 +233,10 @@ def _false_contrast(
 
 def _find_starts(state: UInt8, lung: Mask, spacing_mm: Float, lumen: Int, known: int, starts: Float) -> int:
     """Fill `starts`, `(3, M, 3)`, with the ends of the lumen in the lung and places behind them."""
-    shape = np.array(state.shape, dtype=np.int64)
-    far = np.zeros(state.shape, dtype=np.int32)
+    far, near = np.zeros(state.shape, dtype=np.int32), box_offsets(np.array(state.shape, dtype=np.int64), 1)
     queue, parent = lumen.copy(), np.zeros(len(lumen), dtype=np.int64)
-    near = box_offsets(shape, 1)
     count = thin_airways.walk_lumen(state.reshape(-1), near, queue, known, parent, far.reshape(-1))
     # No lumen so near to an end is farther from the trachea.
     reach = np.ceil(2.0 / spacing_mm).astype(np.int64)
-    return int(
-        thin_airways.find_ends(
-            far, lung, queue, known, count, parent, reach, spacing_mm, starts[0], starts[1], starts[2]
-        )
-    )
+    given = (far, lung, queue, known, count, parent, reach, spacing_mm)
+    return int(thin_airways.find_ends(*given, starts[0], starts[1], starts[2]))

@@ -278,9 +278,8 @@ class _LungParts:
         far = ndimage.distance_transform_edt(~self._vessels, sampling=BLOCK * EDGE_MM) / 6.0
         # Times that of lung: a fissure then outweighs the whole way from a bronchus to it.
         resistance = (1.0 + far**2) * (1.0 + 200.0 * likelihood)
-        along = _conductance(
-            np.pad(resistance.astype(np.float32), 1, constant_values=1.0), np.pad(self._mask, 1)
-        )
+        resistance = np.pad(resistance.astype(np.float32), 1, constant_values=1.0)
+        along = _conductance(resistance, np.pad(self._mask, 1))
         free = np.flatnonzero(np.pad(seeds == 0, 1))
         shares = []
         for lobe in lobes[:-1]:
@@ -309,10 +308,8 @@ class _LungParts:
         return np.maximum(labels, 0).astype(np.uint8)
 
     def _on_cubic(self, blocks: Int32) -> Int32:
-        places = [
-            np.minimum(np.arange(n) // BLOCK, m - 1)
-            for n, m in zip(self._fine.shape, blocks.shape, strict=True)
-        ]
+        sizes = zip(self._fine.shape, blocks.shape, strict=True)
+        places = [np.minimum(np.arange(n) // BLOCK, m - 1) for n, m in sizes]
         return np.ascontiguousarray(blocks[np.ix_(*places)])
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from anatomy.base.errors import AnatomyError, GridMismatchError, SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Float32, Int16, Mask, UInt8
+from anatomy.base.typed import Array, Float, Float32, Int16, Mask, UInt8
 from anatomy.grid import Volume
 from anatomy.machine_code.ahead import usable_cores
 from anatomy.morphology import Window, bounds, closed, window
@@ -112,7 +112,7 @@ class ScaleSpace:
         """Call `work(first, last)` for the parts of an axis; each voxel is written by one call alone."""
         share_axis(work, self.hu.shape[axis], self.threads)
 
-    def whole(self, part: Float32, shape: tuple[int, ...]) -> Float32:
+    def whole(self, part: Array, shape: tuple[int, ...]) -> Array:
         """Return an image of the whole grid, `[i, j, k]`, 0 outside the box."""
         image = np.zeros(shape, dtype=part.dtype, order="F")
         image[self.box] = part.T
@@ -128,8 +128,7 @@ def share_axis(work: Callable[[int, int], None], length: int, threads: int) -> N
             work(*span)
         return
     with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(work, *span) for span in spans]:
-            done.result()
+        list(pool.map(lambda span: work(*span), spans))
 
 
 def discrete_gaussian(variance: float) -> Float32:
@@ -222,11 +221,12 @@ def segment_vessels(
         best = raised
     best[large] = 1.0
     found = space.whole(best, shape)
-    everywhere = np.zeros(shape, dtype=np.bool_, order="F")
-    everywhere[space.box] = large.T
-    mask = found >= np.float32(VESSEL_THRESHOLD)
     return Vessels(
-        vesselness=found, large=everywhere, mask=mask, threshold=VESSEL_THRESHOLD, warnings=warnings
+        vesselness=found,
+        large=space.whole(large, shape),
+        mask=found >= np.float32(VESSEL_THRESHOLD),
+        threshold=VESSEL_THRESHOLD,
+        warnings=warnings,
     )
 
 

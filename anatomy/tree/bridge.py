@@ -45,18 +45,13 @@ def join_pieces(main: Int, pieces: list[Piece], spacing_mm: Float, max_gap_mm: f
 
     `main` are the voxels `(M, 3)` of the main piece; a gap lies between two facing voxels, as solid boxes.
     """
-    best = [_best_gap(main, piece.voxels, spacing_mm, max_gap_mm) for piece in pieces]
+    gaps = (_best_gap(main, piece.voxels, spacing_mm, max_gap_mm) for piece in pieces)
+    best = {p: gap for p, gap in enumerate(gaps) if gap is not None}
     open_pieces = set(range(len(pieces)))
-    while True:
-        found = [(gap.length_mm, p) for p in sorted(open_pieces) if (gap := best[p]) is not None]
-        if not found:
-            return
-        _, chosen = min(found)
-        gap = best[chosen]
-        if gap is None:
-            return
+    while best:
+        chosen = min(best, key=lambda p: (best[p].length_mm, p))
+        gap, voxels = best.pop(chosen), pieces[chosen].voxels
         open_pieces.remove(chosen)
-        voxels = pieces[chosen].voxels
         yield Join(
             voxels=voxels,
             bridge=face_connected_line(gap.begin, gap.end),
@@ -65,8 +60,7 @@ def join_pieces(main: Int, pieces: list[Piece], spacing_mm: Float, max_gap_mm: f
         )
         for p in open_pieces:
             other = _best_gap(voxels, pieces[p].voxels, spacing_mm, max_gap_mm)
-            known = best[p]
-            if other is not None and (known is None or other.length_mm < known.length_mm):
+            if other is not None and (p not in best or other.length_mm < best[p].length_mm):
                 best[p] = other
 
 

@@ -9,6 +9,7 @@ from anatomy.airway_tree import AirwayTree, GapBridged, LoopOpened, SpurPruned, 
 from anatomy.base.errors import AnatomyError
 from anatomy.base.typed import Float, Int
 from anatomy.grid import Volume
+from anatomy.morphology import window
 from anatomy.tree.branches import NodeBranch, Strand, assemble, divide, strands_of
 from anatomy.tree.depth import exact_depth_mm, inside, segments_inside
 from anatomy.tree.lumen import PreparedLumen, complete, prepare_lumen, require_at_most, tunnels
@@ -136,8 +137,7 @@ def _looks_mirrored(tree: AirwayTree) -> bool:
     if len(main) != 2 or any(len(tree.children(b)) == 0 for b in main):
         return False
     ends = tree.points_lps[[tree.branch_start[b + 1] - 1 for b in main]]
-    left = main[int(np.argmax(ends[:, 0]))]
-    right = main[int(np.argmin(ends[:, 0]))]
+    left, right = main[int(np.argmax(ends[:, 0]))], main[int(np.argmin(ends[:, 0]))]
     # The left main bronchus is about twice as long as the right one; less than this share of it means a
     # mirrored image.
     return bool(tree.branch_length_mm[left] < 0.8 * tree.branch_length_mm[right])
@@ -198,9 +198,9 @@ def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> V
     corners = np.array([*begins, end])
     low = np.maximum(corners.min(axis=0) - MARGIN_VOXELS, 0)
     high = corners.max(axis=0) + MARGIN_VOXELS + 1
-    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    depth = prepared.depth_mm[window].astype(np.float64)
-    cost = np.where(prepared.lumen[window], 1.0 / np.maximum(depth, 1e-3) ** 2, -1.0)
+    box = window(low, high)
+    depth = prepared.depth_mm[box].astype(np.float64)
+    cost = np.where(prepared.lumen[box], 1.0 / np.maximum(depth, 1e-3) ** 2, -1.0)
     search = MCP_Geometric(cost, fully_connected=False, sampling=tuple(prepared.grid.spacing_mm))
     target = tuple((np.array(end) - low).tolist())
     total, _ = search.find_costs([tuple((np.array(b) - low).tolist()) for b in begins], [target])
@@ -262,8 +262,7 @@ def _united(points: Float, radius: Float, pairs: Int) -> tuple[Float, Float, Int
     _, first, index = np.unique(label, return_index=True, return_inverse=True)
     # Numbered by first occurrence, so that the order of the file is kept.
     order = np.argsort(first)
-    rank = np.argsort(order)
-    mapped = np.sort(rank[index][pairs], axis=1)
+    mapped = np.sort(np.argsort(order)[index][pairs], axis=1)
     mapped = np.unique(mapped[mapped[:, 0] != mapped[:, 1]], axis=0)
     return points[first[order]], radius[first[order]], mapped
 
@@ -295,10 +294,9 @@ def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: fl
     marks |= set(voxel_tree.parent[voxel_tree.across_gap].tolist())
     lines = [_resample(branch, voxel_tree, prepared, marks, spacing_mm) for branch in branches]
     ends = np.cumsum([len(points) for points, _ in lines])
-    radius = np.split(
-        exact_depth_mm(prepared.lumen, voxel_mm, np.concatenate([points for points, _ in lines])), ends[:-1]
-    )
-    return strands_of(branches, [(prepared.grid.lps(points), index) for points, index in lines], radius)
+    along = exact_depth_mm(prepared.lumen, voxel_mm, np.concatenate([points for points, _ in lines]))
+    lines = [(prepared.grid.lps(points), index) for points, index in lines]
+    return strands_of(branches, lines, np.split(along, ends[:-1]))
 
 
 def _drop_cap(branches: list[NodeBranch], mm: Float, depth_mm: Float) -> None:

@@ -108,12 +108,11 @@ def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOu
         distance, index = nearest.query(piece.voxels * grid.spacing_mm)
         at = int(np.argmin(distance))
         ends = np.stack([piece.voxels[at], kept[index[at]]])
+        between_mm = np.maximum(np.abs(ends[0] - ends[1]) - 1, 0) * grid.spacing_mm
         found.append(
             PieceLeftOut(
                 position_lps=grid.lps(ends.mean(axis=0)),
-                length_mm=float(
-                    np.linalg.norm(np.maximum(np.abs(ends[0] - ends[1]) - 1, 0) * grid.spacing_mm)
-                ),
+                length_mm=float(np.linalg.norm(between_mm)),
                 middle_lps=grid.lps(piece.voxels.mean(axis=0)),
                 voxels=len(piece.voxels),
             )
@@ -248,9 +247,8 @@ def _way_to_farthest(open_voxels: Int, skeleton: Int, prepared: PreparedLumen) -
     spacing = prepared.grid.spacing_mm
     distance, _ = KDTree(skeleton * spacing).query(open_voxels * spacing)
     target = open_voxels[int(np.argmax(distance))]
-    margin = np.ceil((float(distance.min()) + 2 * float(prepared.solid_depth_mm.max())) / spacing).astype(
-        np.int64
-    )
+    margin_mm = float(distance.min()) + 2 * float(prepared.solid_depth_mm.max())
+    margin = np.ceil(margin_mm / spacing).astype(np.int64)
     while True:
         low = np.maximum(open_voxels.min(axis=0) - margin, 0)
         high = np.minimum(open_voxels.max(axis=0) + margin + 1, prepared.solid.shape)

@@ -213,9 +213,7 @@ class _Lung:
         concentration = np.where(atlas.sizes == 1, CONCENTRATION, STEM_CONCENTRATION)
         fit = atlas.prior + _log_density(atlas.mean @ self._shape.direction[group[0]], concentration)
         excess = np.log(share * atlas.sizes[atlas.whole] / np.maximum(atlas.sizes, 1))
-        if not self._tree.children(
-            group[0]
-        ).size:  # the mask ends here: it does not tell how much lies beyond
+        if not self._tree.children(group[0]).size:  # The mask ends here, and does not tell what lies beyond.
             excess = np.maximum(excess, 0.0)
         # Segments have equal shares of a lung's airways within a factor of e, as masks end early or late.
         fit -= 0.5 * excess**2
@@ -315,12 +313,8 @@ def name_bronchi(tree: BranchedTree) -> BronchialNames:
         if roots:
             _name_lung(side, tree, _Lung(side, tree, shape, roots), names, confidence, lobes)
     above = [names[max(int(parent), 0)] for parent in tree.branch_parent]
-    starts = np.array(
-        [
-            name != "" and (name != its or not b)
-            for b, (name, its) in enumerate(zip(names, above, strict=True))
-        ]
-    )
+    pairs = enumerate(zip(names, above, strict=True))
+    starts = np.array([name != "" and (name != its or not b) for b, (name, its) in pairs])
     return BronchialNames(names=tuple(names), starts=starts, confidence=confidence, lobes=lobes)
 
 

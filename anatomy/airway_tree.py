@@ -139,19 +139,14 @@ class AirwayTree:
                 return f"{name} has the shape {getattr(self, name).shape}, not {shape}"
         if n == 0 or b == 0:
             return "it has no points"
-        if not all(
-            np.isfinite(getattr(self, name)).all() for name in ("points_lps", "radius_mm", "tangents")
-        ):
+        measured = (self.points_lps, self.radius_mm, self.tangents)
+        if not all(np.isfinite(each).all() for each in measured):
             return "a point, radius or tangent is not finite"
         if self.branch_start[0] != 0 or self.branch_start[-1] != n or (np.diff(self.branch_start) < 1).any():
             return "branch_start does not divide the points"
         if not np.array_equal(self.branch_of_point, np.repeat(np.arange(b), np.diff(self.branch_start))):
             return "branch_of_point disagrees with branch_start"
-        return self._problem_of_parents()
-
-    def _problem_of_parents(self) -> str:
-        index = np.arange(self.n_points)
-        first = np.zeros(self.n_points, dtype=bool)
+        index, first = np.arange(n), np.zeros(n, dtype=bool)
         first[self.branch_start[:-1]] = True
         if self.parent_point[0] != -1 or (self.parent_point[1:] < 0).any():
             return "it has not exactly one root"
@@ -160,10 +155,8 @@ class AirwayTree:
         hangs_on = self.branch_of_point[self.parent_point[self.branch_start[1:-1]]]
         if self.branch_parent[0] != -1 or not np.array_equal(hangs_on, self.branch_parent[1:]):
             return "branch_parent disagrees with parent_point"
-        if (
-            self.generation[0] != 0
-            or (self.generation[1:] != self.generation[self.branch_parent[1:]] + 1).any()
-        ):
+        expected = self.generation[self.branch_parent[1:]] + 1
+        if self.generation[0] != 0 or not np.array_equal(self.generation[1:], expected):
             return "generation disagrees with branch_parent"
         return ""
 

@@ -42,30 +42,27 @@ def directions(tree: AirwayTree, left: Float, right: Float, lowest_mm: float) ->
         # The base lies 9 to 30 mm behind the rest; less says nothing.
         front.append(_sign(float(np.mean(bases)), 3.0))
     found = []
-    for name, what, votes in (
-        ("axes", "upside down or lying across: the trachea does not run upwards", up),
-        (
-            "axes",
-            "front to back: trachea and bases of the lungs lie as if front and back were exchanged",
-            front,
-        ),
-        (
-            "sides",
-            "mirrored: main bronchi and heart lie as if left and right were exchanged",
-            _left(tree, lungs, carina),
-        ),
+    left_right = _left(tree, lungs, carina)
+    for what, votes in (
+        ("upside down or lying across: the trachea does not run upwards", up),
+        ("front to back: trachea and bases of the lungs lie as if front and back were exchanged", front),
+        ("mirrored: main bronchi and heart lie as if left and right were exchanged", left_right),
     ):
-        decided = [vote for vote in votes if vote]
-        if not decided or max(decided) > 0 > min(decided):
-            if name == "sides" or decided:
-                found.append(_doubt(name))
-        elif max(decided) < 0 and (name == "sides" or len(decided) > 1 or what.startswith("upside")):
+        decided, is_sides = [vote for vote in votes if vote], what.startswith("mirrored")
+        name = "sides" if is_sides else "axes"
+        if min(decided, default=0) > 0 or not (decided or is_sides):
+            continue
+        if max(decided, default=0) < 0 and (is_sides or len(decided) > 1 or what.startswith("upside")):
             remedy = "Check the header of the image: its directions may be wrong"
-            if name == "sides":
-                remedy += "; or the organs of this patient are mirrored"
+            remedy += "; or the organs of this patient are mirrored" if is_sides else ""
             found.append(Finding(name=name, found=f"The image is {what}", remedy=remedy))
-        elif max(decided) < 0:
-            found.append(_doubt(name))
+            continue
+        unsure = "left and right" if is_sides else "front and back"
+        said = (
+            f"The anatomy does not tell {unsure} for sure: look at a picture of the masks whether they are "
+            "where they belong. If the header is wrong, every plan is for the wrong place."
+        )
+        found.append(Finding(name=name, verdict=DOUBTFUL, found=said))
     return found
 
 
@@ -133,13 +130,3 @@ def _heart_mm(lungs: list[Float], carina: Float) -> float | None:
         return None
     middle = np.mean([0.5 * (inner[0][line] + inner[1][line]) for line in sorted(shared)])
     return float(middle - carina[0])
-
-
-def _doubt(name: str) -> Finding:
-    what = "left and right" if name == "sides" else "front and back"
-    return Finding(
-        name=name,
-        verdict=DOUBTFUL,
-        found=f"The anatomy does not tell {what} for sure: look at a picture of the masks whether they are "
-        "where they belong. If the header is wrong, every plan is for the wrong place.",
-    )

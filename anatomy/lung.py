@@ -63,12 +63,10 @@ class Lung(Organ):
     def mask_words(self) -> str:
         """What a proof rests on: the airway of the masks, what was left out, and what is in doubt."""
         report = self.tree.report
-        left_out = (
-            f", without {report.components_dropped} pieces ({report.voxels_dropped} voxels) that hang on "
-            "nothing"
-            if report.components_dropped
-            else ""
-        )
+        left_out = ""
+        if report.components_dropped:
+            left_out = f", without {report.components_dropped} pieces ({report.voxels_dropped} voxels) that "
+            left_out += "hang on nothing"
         doubts = dict.fromkeys(each.name for each in self.findings if each.verdict != FITS)
         look = f"; their checks of {', '.join(doubts)} are not as usual" if doubts else ""
         return f"the masks of {self.name}, with an airway of {self.tree.n_branches} branches{left_out}{look}"

@@ -149,9 +149,8 @@ def pieces_of(mask: Mask, *, corners: bool = False) -> tuple[Int32, Int]:
     """
     from scipy import ndimage
 
-    pieces, count = ndimage.label(
-        mask, ndimage.generate_binary_structure(mask.ndim, mask.ndim if corners else 1)
-    )
+    joined = ndimage.generate_binary_structure(mask.ndim, mask.ndim if corners else 1)
+    pieces, count = ndimage.label(mask, joined)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
     sizes[0] = 0
     return pieces, sizes

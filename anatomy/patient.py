@@ -84,7 +84,15 @@ class PatientImages:
             numbers = getattr(self, name)
             if numbers is not None:
                 self.grid.require_same(numbers.grid, f"the {name.replace('_', ' ')}")
-        _require_border(self.vessel_border_mm)
+        border_mm = self.vessel_border_mm
+        # No border that is known lies a centimetre off; so far off the mask is of something else.
+        mean, spread = border_mm or (0.0, 0.0) if len(border_mm) in (0, 2) else (np.nan, np.nan)
+        if not (abs(mean) <= 10.0 and 0.0 <= spread <= 10.0):
+            raise AnatomyError(
+                f"The border of the vessels is {list(border_mm)}",
+                expected="two numbers in mm: a mean from -10 to 10, and a standard deviation from 0 to 10",
+                remedy="Correct vessel_border_mm in patient.toml, or leave it out",
+            )
         if self.cost is not None:
             _require_cost(self.cost, self.grid)
         object.__setattr__(self, "starts", tuple(read_only(np.array(p, float)) for p in self.starts))
@@ -94,17 +102,6 @@ class PatientImages:
             names = getattr(self, f"{what}_names") or tuple(f"{what}{n + 1}" for n in range(len(given)))
             object.__setattr__(self, f"{what}_names", names)
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
-
-
-def _require_border(border_mm: tuple[float, ...]) -> None:
-    # No border that is known lies a centimetre off; so far off the mask is of something else.
-    mean, spread = border_mm or (0.0, 0.0) if len(border_mm) in (0, 2) else (np.nan, np.nan)
-    if not (abs(mean) <= 10.0 and 0.0 <= spread <= 10.0):
-        raise AnatomyError(
-            f"The border of the vessels is {list(border_mm)}",
-            expected="two numbers in mm: a mean from -10 to 10, and a standard deviation from 0 to 10",
-            remedy="Correct vessel_border_mm in patient.toml, or leave it out",
-        )
 
 
 def _require_cost(cost: Volume, grid: Grid) -> None:

@@ -30,7 +30,15 @@ def open_metaimage(path: Path, components: int = 1) -> tuple[image_header.ImageH
     perpendicular.
     """
     fields, offset = _text(path)
-    _require_plain(fields, path)
+    image_header.require_plain_fields(fields, _PLAIN, path)
+    known = {"NDims": ("3",), "ElementType": _DTYPES}
+    odd = {key: fields.get(key, "missing") for key, held in known.items() if fields.get(key) not in held}
+    if odd:
+        raise FileError(
+            f"{path} says {', '.join(f'{key} = {value[:40]}' for key, value in odd.items())}",
+            expected="one image of three dimensions, stored as binary data",
+            remedy="Save the image again, as 3D Slicer or ITK do",
+        )
     channels = fields.get("ElementNumberOfChannels", "1")
     if channels != str(components):
         raise image_header.not_of_components(path, channels[:40], components)
@@ -60,26 +68,9 @@ def _text(path: Path) -> tuple[dict[str, str], int]:
     if end is None:
         raise image_header.not_begun(path, "MetaImage", "a .mha or .mhd file")
     lines = start[: end.end()].decode("utf-8-sig", errors="replace").splitlines()
-    pairs = (line.partition("=") for line in lines if line.strip())
-    return image_header.fields_once(
-        ((key.strip(), value.strip()) for key, _, value in pairs), path
-    ), end.end()
-
-
-def _require_plain(fields: Mapping[str, str], path: Path) -> None:
-    image_header.require_plain_fields(fields, _PLAIN, path)
-    odd = {}
-    if fields.get("NDims") != "3":
-        odd["NDims"] = fields.get("NDims", "missing")
-    if fields.get("ElementType") not in _DTYPES:
-        odd["ElementType"] = fields.get("ElementType", "missing")
-    if odd:
-        said = ", ".join(f"{key} = {value[:40]}" for key, value in odd.items())
-        raise FileError(
-            f"{path} says {said}",
-            expected="one image of three dimensions, stored as binary data",
-            remedy="Save the image again, as 3D Slicer or ITK do",
-        )
+    parts = (line.partition("=") for line in lines if line.strip())
+    pairs = ((key.strip(), value.strip()) for key, _, value in parts)
+    return image_header.fields_once(pairs, path), end.end()
 
 
 def _data_file(fields: Mapping[str, str], path: Path, offset: int) -> tuple[Path, int]:

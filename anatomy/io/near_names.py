@@ -49,10 +49,8 @@ def require_single(
                 remedy="Remove or rename the one that is not meant, or write a patient.toml that names the "
                 "other one",
             )
-        said.setdefault(
-            frozenset((path, other)),
-            f"{path.name} is read; {other.name} stands for the same mask and holds the same.",
-        )
+        words = f"{path.name} is read; {other.name} stands for the same mask and holds the same."
+        said.setdefault(frozenset((path, other)), words)
     return list(said.values())
 
 
@@ -60,9 +58,8 @@ def looks_like(names: Iterable[str], images: Mapping[str, Path]) -> Path | None:
     """Return the image whose plain name is nearest to one of `names` or holds one, or None."""
     wanted = [plain(name) for name in names]
     # A name of four letters or fewer is part of many words.
-    holding = [
-        path for name, path in images.items() if any(len(each) > 4 and each in name for each in wanted)
-    ]
+    telling = [each for each in wanted if len(each) > 4]
+    holding = [path for name, path in images.items() if any(each in name for each in telling)]
     if holding:
         return holding[0]
     # Least likeness (0 to 1) of a name that is offered for a missing one: a slip or two of the pen.

@@ -25,6 +25,7 @@ from anatomy.phantom.branching import Centerlines
 from anatomy.phantom.chest import LOBES
 from anatomy.phantom.patient import SCALES, Phantom
 from anatomy.phantom.rasterize import LABELS
+from anatomy.phantom.territory import Bulla
 
 BORDER_MM = 12.0
 """The field goes on so far beyond the lungs."""
@@ -50,7 +51,17 @@ def write_phantom(
     for name, volume in volumes.items():
         if volume is not None:
             write_volume(folder / f"{name}.nii.gz", volume)
-    truth = _truth(phantom)
+    truth: dict[str, Any] = {
+        "seed": phantom.seed,
+        "size": phantom.size,
+        "traits": asdict(phantom.traits),
+        "frame": "lps",
+        "labels": LABELS,
+        "lobes": LOBES,
+        "nodules": [{**_ball(each), "lobe": each.lobe} for each in phantom.nodules],
+        "bullae": [_ball(each) for each in phantom.bullae],
+        "centerlines": {kind: _tree(lines) for kind, lines in phantom.centerlines.items()},
+    }
     lines = description_text(
         {
             "name": images.name,
@@ -70,21 +81,8 @@ def write_phantom(
     return folder
 
 
-def _truth(phantom: Phantom) -> dict[str, Any]:
-    return {
-        "seed": phantom.seed,
-        "size": phantom.size,
-        "traits": asdict(phantom.traits),
-        "frame": "lps",
-        "labels": LABELS,
-        "lobes": LOBES,
-        "nodules": [
-            {"centre_lps": n.centre_lps.tolist(), "radius_mm": n.radius_mm, "lobe": n.lobe}
-            for n in phantom.nodules
-        ],
-        "bullae": [{"centre_lps": b.centre_lps.tolist(), "radius_mm": b.radius_mm} for b in phantom.bullae],
-        "centerlines": {kind: _tree(lines) for kind, lines in phantom.centerlines.items()},
-    }
+def _ball(ball: Bulla) -> dict[str, Any]:
+    return {"centre_lps": ball.centre_lps.tolist(), "radius_mm": ball.radius_mm}
 
 
 def _tree(lines: Centerlines) -> dict[str, Any]:
@@ -147,6 +145,5 @@ class PhantomBreathing:
     def source(self, phantom: Phantom) -> MotionSource:
         """Return the motion as it would be read from the field."""
         grid, vectors = self.field(phantom)
-        return MotionSource(
-            description="the phantom's own breathing", masks_phase=1.0, grid=grid, vectors=vectors
-        )
+        words = "the phantom's own breathing"
+        return MotionSource(description=words, masks_phase=1.0, grid=grid, vectors=vectors)

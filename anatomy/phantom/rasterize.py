@@ -61,17 +61,9 @@ def draw_body(chest: Chest, grid: Grid, open_fissures: float = 0.0, *, precise: 
     In single precision, which is faster, a few voxels at the surfaces depend on the kind of processor.
     """
     shape = grid.shape
-    images = [np.zeros(shape, dtype=np.uint8, order="F") for _ in range(6)]
-    canvas = Canvas(
-        grid=grid,
-        labels=images[0],
-        lobes=images[1],
-        owner=np.zeros(shape, dtype=np.int16, order="F"),
-        lung_cover=images[2],
-        lumen_cover=images[3],
-        airway_cover=images[4],
-        solid_cover=images[5],
-    )
+    names = ("labels", "lobes", "lung_cover", "lumen_cover", "airway_cover", "solid_cover")
+    images = {name: np.zeros(shape, dtype=np.uint8, order="F") for name in names}
+    canvas = Canvas(grid=grid, owner=np.zeros(shape, dtype=np.int16, order="F"), **images)
     half = shape[0] // 2
     first = grid.lps_from_ijk[:3, 3]
     real = np.float64 if precise else np.float32
@@ -99,13 +91,8 @@ def _around(chest: Chest, side: Side, x: Array, y: Array, z: Array) -> UInt8:
     body = (np.abs(x) / (152 * shoulder)) ** 2.6 + (np.abs(y + 1) / (107 * shoulder)) ** 2.6 < 1
     cage = side.cage(x, y, z)
     lateral = side.sign * x
-    ribs = (
-        (cage > 4)
-        & (cage < 12)
-        & (lateral > 26)
-        & (np.mod(z - RIB_SLOPE * y, RIB_DISTANCE_MM) < RIB_HEIGHT_MM)
-    )
-    ribs &= z > CAGE_CENTRE_Z - 75
+    ribs = (cage > 4) & (cage < 12) & (lateral > 26) & (z > CAGE_CENTRE_Z - 75)
+    ribs &= np.mod(z - RIB_SLOPE * y, RIB_DISTANCE_MM) < RIB_HEIGHT_MM
     spine = (x / 19) ** 2 + ((y - 66) / 16) ** 2 < 1
     spinous = (np.abs(x) < 4) & (y > 84) & (y < 100) & (np.mod(z, 26) < 15)
     sternum = (np.abs(x) < 15) & (np.abs(y + 95) < 5) & (z < -10) & (z > -140)
@@ -148,10 +135,8 @@ def draw_tree(canvas: Canvas, tree: PlannedTree, base: int, kind: str) -> Mask:
     keep = np.zeros(len(sprouts.parent), dtype=np.bool_)
     # Children are thinner than their parents, so parents come first.
     order = np.argsort(-np.array(sprouts.diameter_mm), kind="stable").astype(np.int64)
-    start, parents = (
-        np.concatenate([[0], np.cumsum(sprouts.counts)]),
-        np.array(sprouts.parent, dtype=np.int64),
-    )
+    start = np.concatenate([[0], np.cumsum(sprouts.counts)])
+    parents = np.array(sprouts.parent, dtype=np.int64)
     spacing, origin = canvas.spacing_mm, canvas.grid.lps_from_ijk[:3, 3].copy()
     if kind == "airway":
         cover, gap, slack, codes = canvas.airway_cover, spacing, 0.0, (LABELS["lumen"], LABELS["wall"])
@@ -184,11 +169,7 @@ def draw_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> None:
 
 def _around_ball(canvas: Canvas, centre_lps: Float, radius_mm: float) -> tuple[tuple[slice, ...], Float]:
     """Return the voxels around a ball, and the distances of their centres from its centre, mm."""
-    middle = canvas.grid.ijk(centre_lps)
-    reach = radius_mm / canvas.spacing_mm + 1.5
-    low = np.maximum(np.floor(middle - reach).astype(int), 0)
-    high = np.minimum(np.ceil(middle + reach).astype(int) + 1, canvas.grid.shape)
-    block = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    ranges = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+    block = canvas.grid.window(centre_lps, radius_mm + 1.5 * canvas.spacing_mm)
+    ranges = [np.arange(axis.start, axis.stop) for axis in block]
     ijk = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1)
     return block, np.linalg.norm(canvas.grid.lps(ijk) - centre_lps, axis=-1)

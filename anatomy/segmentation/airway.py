@@ -196,8 +196,7 @@ def _sliced(hu: Int16, axis: int, spacing_mm: Float) -> Int16:
     target = np.moveaxis(out, axis, 0)
     scale = scale_of(np.delete(spacing_mm, axis))
     with ThreadPoolExecutor(_THREADS) as pool:
-        for _ in pool.map(partial(_some, slices, scale, target), range(_THREADS)):
-            pass
+        list(pool.map(partial(_some, slices, scale, target), range(_THREADS)))
     return out
 
 

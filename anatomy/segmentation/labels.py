@@ -129,15 +129,13 @@ def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
     # Every coarse voxel has the side that is nearest to it.
     right, left = (distance_mm(sides != side, coarse.spacing_mm) for side in (RIGHT, LEFT))
     nearest = np.where(right <= left, RIGHT, LEFT).astype(np.uint8)
-    low, high = np.zeros(3, dtype=np.int64), np.asarray(mask.shape)
-    fine = coarse.to_ct(nearest, low, high)
+    fine = coarse.to_ct(nearest, np.zeros(3, dtype=np.int64), np.asarray(mask.shape))
     return mask & (fine == LEFT), mask & (fine == RIGHT)
 
 
 def sides_from_right(tissue: Mask, coarse: CoarseCt) -> Int32 | None:
     """Label the right lung 1 and the left 2 over coarse voxels of lung; None if there are not two."""
-    low, high = bounds(tissue)
-    box = window(low, high)
+    box = window(*bounds(tissue))
     found = grow_sides(tissue[box], tissue[box], coarse.grid.lps_from_ijk[:3, :3])
     if found is None:
         return None

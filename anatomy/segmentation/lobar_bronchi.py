@@ -67,23 +67,18 @@ def lobes_of_branches(regions: Regions, lobes: tuple[int, ...]) -> Int:
     where that is better, because a lobe can have several bronchi.  Good is a parting whose parts meet where
     fissures are seen, have about usual shares of the lung, and hold the bronchi that are named after them.
     """
-    count = len(regions.volume)
     whole = regions.volume[regions.used].sum()
     large = [
         int(branch)
         for branch in np.flatnonzero(regions.used)
         if regions.volume[regions.below[branch] & regions.used].sum() >= LEAST_SHARE * whole
     ]
-    partings = [
-        _named(regions, _parted(regions, cuts), lobes)
-        for cuts in itertools.combinations(large, len(lobes) - 1)
-    ]
+    ways = itertools.combinations(large, len(lobes) - 1)
+    partings = [_named(regions, _parted(regions, cuts), lobes) for cuts in ways]
     partings.append(np.where(regions.used & np.isin(regions.named, lobes), regions.named, 0))
     partings.sort(key=lambda lobe: -_value(regions, lobe, lobes))
     settled = [_settled(regions, lobe, lobes) for lobe in partings[:STARTS]]
-    return max(
-        settled, key=lambda lobe: _value(regions, lobe, lobes), default=np.zeros(count, dtype=np.int64)
-    )
+    return max(settled, key=lambda lobe: _value(regions, lobe, lobes))
 
 
 def _settled(regions: Regions, lobe: Int, lobes: tuple[int, ...]) -> Int:

@@ -61,7 +61,14 @@ def replan(
         return _decided(patient, poses, frame, plan, errors, placement, radius, record, output)
     Objective.of(objective)
     stated, device = target.stated(), system.load()
-    pose, of_plan = _measured(scope, tube, frame)
+    given = scope if tube is None else tube
+    if given is None or (scope is not None and tube is not None):
+        raise SettingsError(
+            "Both --scope and --tube are given" if given else "Neither --scope nor --tube is given",
+            expected="one of them: where the tip of the scope or of the tubes really is",
+            remedy="`lungaccess template pose` prints a file to start from",
+        )
+    pose, of_plan = _pose(given, "scope" if tube is None else "tubes", frame)
     lung = output.load(patient)
     if of_plan is not None:
         of_plan.require_lung(lung)
@@ -111,19 +118,6 @@ def _decided(
     output.tell(decision.record())
     terminal.show(decision_tables(decision))
     return ExitCode.of(decision.goes_on)
-
-
-def _measured(
-    scope: str | None, tube: str | None, frame: options.FrameOfPose
-) -> tuple[lazy.Float, lazy.Plan | None]:
-    given = scope if tube is None else tube
-    if given is None or (scope is not None and tube is not None):
-        raise SettingsError(
-            "Both --scope and --tube are given" if given else "Neither --scope nor --tube is given",
-            expected="one of them: where the tip of the scope or of the tubes really is",
-            remedy="`lungaccess template pose` prints a file to start from",
-        )
-    return _pose(given, "scope" if tube is None else "tubes", frame)
 
 
 def _pose(given: str, stage: str, frame: options.FrameOfPose) -> tuple[lazy.Float, lazy.Plan | None]:

@@ -258,20 +258,7 @@ def route(
     if output.json:
         terminal.show_json(written)
         return ExitCode.of(found.proved)
-    terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), _rows(found, written))])
-    terminal.show_warnings(opened.warnings)
-    terminal.say(f"Written to {out}: route.json, route.png")
-    try:
-        lazy.require_proved(found)
-    except lazy.NoRouteError as error:
-        terminal.show_error(error)
-        return ExitCode.NEGATIVE
-    return ExitCode.OK
-
-
-def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
-    limits = found.limits
-    return [
+    rows = [
         ("length", f"{written['length_mm']:.1f} mm", ""),
         ("largest curvature", f"{written['largest_curvature_per_mm']:.4f} per mm",
          f"at most {limits.max_curvature_per_mm:g}"),
@@ -280,3 +267,12 @@ def _rows(found: lazy.Route, written: dict[str, object]) -> list[terminal.Row]:
         ("ends off by", f"{found.end_error_mm:.2f} mm", f"at most {limits.end_tolerance_mm:g}"),
         ("proved on the whole curve", "yes" if found.proved else "NO", ""),
     ]  # fmt: skip
+    terminal.show([terminal.table(f"Route along {opened.name}", ("", "", "limit"), rows)])
+    terminal.show_warnings(opened.warnings)
+    terminal.say(f"Written to {out}: route.json, route.png")
+    try:
+        lazy.require_proved(found)
+    except lazy.NoRouteError as error:
+        terminal.show_error(error)
+        return ExitCode.NEGATIVE
+    return ExitCode.OK

@@ -128,20 +128,15 @@ def _table(title: str, groups: "list[lazy.Group]") -> Table:
         "case", "planner", "runs", "failed", "solved, %", "accepted, %", "first, s", "run, s", "cost",
         "succeeds, %",
     )  # fmt: skip
+    rows = [
+        (
+            group.case, group.planner, f"{group.runs}", f"{group.failed}", of_hundred(group.solved_share),
+            of_hundred(group.accepted_share) if group.first_plan_s else "",
+            "" if group.first_plan_s is None else f"{group.first_plan_s[0]:.3f}", f"{group.run_s:.2f}",
+            "" if group.cost is None else f"{group.cost:.4g}",
+            "" if group.success is None else of_hundred(group.success),
+        )
+        for group in groups
+    ]  # fmt: skip
     columns = len(headings) - all(group.success is None for group in groups)
-    return terminal.table(title, headings[:columns], [_row(group)[:columns] for group in groups])
-
-
-def _row(group: "lazy.Group") -> tuple[str, ...]:
-    return (
-        group.case,
-        group.planner,
-        str(group.runs),
-        str(group.failed),
-        of_hundred(group.solved_share),
-        of_hundred(group.accepted_share) if group.first_plan_s else "",
-        "" if group.first_plan_s is None else f"{group.first_plan_s[0]:.3f}",
-        f"{group.run_s:.2f}",
-        "" if group.cost is None else f"{group.cost:.4g}",
-        "" if group.success is None else of_hundred(group.success),
-    )
+    return terminal.table(title, headings[:columns], [row[:columns] for row in rows])

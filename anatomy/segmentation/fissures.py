@@ -89,11 +89,9 @@ def _in_agreement(strength: Float32, normal: Float32) -> Float32:
     from scipy import ndimage
 
     at = np.nonzero(strength)
-    place = tuple(
-        np.minimum(axis // BLOCK, n // BLOCK - 1) for axis, n in zip(at, strength.shape, strict=True)
-    )
-    along = np.zeros(len(at[0]), dtype=np.float32)
-    total = np.zeros(len(at[0]), dtype=np.float32)
+    sizes = zip(at, strength.shape, strict=True)
+    place = tuple(np.minimum(axis // BLOCK, n // BLOCK - 1) for axis, n in sizes)
+    along, total = (np.zeros(len(at[0]), dtype=np.float32) for _ in range(2))
     for a in range(3):
         for b in range(a, 3):
             summed = blocks_of(strength * normal[a] * normal[b]).mean(axis=(1, 3, 5), dtype=np.float32)
@@ -123,10 +121,8 @@ class Cubic:
     @classmethod
     def over(cls, grid: Grid) -> Self:
         """Return the cubic voxels over the box of a grid."""
-        nk, nj, ni = (
-            max(1, round(n * h / EDGE_MM))
-            for n, h in zip(reversed(grid.shape), reversed(grid.spacing_mm), strict=True)
-        )
+        sizes = zip(grid.shape, grid.spacing_mm, strict=True)
+        ni, nj, nk = (max(1, round(n * h / EDGE_MM)) for n, h in sizes)
         return cls(grid=grid, shape=(nk, nj, ni))
 
     def mean(self, image: Array) -> Float32:

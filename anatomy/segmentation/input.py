@@ -58,12 +58,11 @@ def require_chest_ct(ct: Volume, *, thick_slices: bool = False) -> tuple[str, ..
     """
     _require_numbers(ct.array)
     _require_hounsfield(ct.array)
-    greatest = float(ct.array.max())
+    warnings, greatest = _require_size(ct, thick_slices), float(ct.array.max())
     # Metal reaches the 3071 HU of most scanners; more than this is another scale.
-    odd = (
-        (f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.",) if greatest > 5000.0 else ()
-    )
-    return (*_require_size(ct, thick_slices), *odd)
+    if greatest > 5000.0:
+        warnings.append(f"The image reaches {greatest:g} HU: metal, or not Hounsfield units.")
+    return tuple(warnings)
 
 
 def _require_numbers(values: Array) -> None:
@@ -105,7 +104,7 @@ def _require_hounsfield(values: Array) -> None:
         )
 
 
-def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
+def _require_size(ct: Volume, thick_slices: bool) -> list[str]:
     spacing = ct.grid.spacing_mm
     extent = spacing * np.asarray(ct.grid.shape)
     if not extent.min() >= LEAST_SIZE_MM:
@@ -116,12 +115,11 @@ def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
         )
     thickness = slice_mm(ct)
     if thickness > THICKEST_SLICE_MM or (thickness > THICK_SLICE_MM and not thick_slices):
-        allowed = thickness <= THICKEST_SLICE_MM
+        or_accept = "; or accept the loss with --thick-slices" if thickness <= THICKEST_SLICE_MM else ""
         raise AnatomyError(
             f"The slices are {thickness:.1f} mm apart",
             expected=f"at most {THICK_SLICE_MM:g} mm: small airways and vessels are lost between such slices",
-            remedy="Reconstruct thinner slices"
-            + ("; or accept the loss with --thick-slices" if allowed else ""),
+            remedy=f"Reconstruct thinner slices{or_accept}",
         )
     warnings = []
     if thickness > THICK_SLICE_MM:
@@ -134,7 +132,7 @@ def _require_size(ct: Volume, thick_slices: bool) -> tuple[str, ...]:
             f"The smallest voxel size is {spacing.min():.2f} mm; {SPACING_MM[0]:g} to {SPACING_MM[1]:g} mm "
             "are usual."
         )
-    return tuple(warnings)
+    return warnings
 
 
 @frozen_value
@@ -162,11 +160,9 @@ class Scale:
     def on(self, values: Array) -> Float32:
         """Return values in Hounsfield units."""
         moved = values - np.float32(self.offset_hu)
-        return (
-            moved
-            if self.gain == 1.0
-            else (moved - np.float32(AIR_HU)) * np.float32(self.gain) + np.float32(AIR_HU)
-        )
+        if self.gain == 1.0:
+            return moved
+        return (moved - np.float32(AIR_HU)) * np.float32(self.gain) + np.float32(AIR_HU)
 
     def image(self, ct: Volume) -> Volume:
         """Return an image in Hounsfield units; the image itself if it has them."""

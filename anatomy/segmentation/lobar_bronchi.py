@@ -10,12 +10,9 @@ from anatomy.base.typed import Bool, Float, Int
 from anatomy.lobes import LEFT_LOWER, LEFT_UPPER, RIGHT_LOWER, RIGHT_MIDDLE, RIGHT_UPPER
 
 USUAL_SHARES: Mapping[int, tuple[float, float]] = {
-    RIGHT_UPPER: (0.37, 0.15),
-    RIGHT_MIDDLE: (0.17, 0.08),
-    RIGHT_LOWER: (0.46, 0.15),
-    LEFT_UPPER: (0.52, 0.15),
-    LEFT_LOWER: (0.48, 0.15),
-}
+    RIGHT_UPPER: (0.37, 0.15), RIGHT_MIDDLE: (0.17, 0.08), RIGHT_LOWER: (0.46, 0.15),
+    LEFT_UPPER: (0.52, 0.15), LEFT_LOWER: (0.48, 0.15),
+}  # fmt: skip
 """Mean share of each lobe in its lung, and twice the spread of the healthy, as lobes shrink and swell."""
 LEAST_SHARE = 0.03
 """No lobe is smaller, unless it has collapsed."""

@@ -198,16 +198,11 @@ def quality_of(parts: Parts) -> Quality:
     """Measure a segmentation."""
     litre = parts.ct.grid.voxel_volume_mm3 * 1e-6
     counted = {
-        "right lung": parts.right,
-        "left lung": parts.left,
-        "airway lumen": parts.lumen,
-        "airway wall": parts.wall,
-        "large vessels": parts.large_vessels,
-        "all vessels": parts.all_vessels,
-        "nodule": parts.nodule,
-        "band of the fissures": (parts.fissures > 0) & (parts.fissures < UNKNOWN),
+        "right lung": parts.right, "left lung": parts.left, "airway lumen": parts.lumen,
+        "airway wall": parts.wall, "large vessels": parts.large_vessels, "all vessels": parts.all_vessels,
+        "nodule": parts.nodule, "band of the fissures": (parts.fissures > 0) & (parts.fissures < UNKNOWN),
         "lung without known fissures": parts.fissures == UNKNOWN,
-    }
+    }  # fmt: skip
     volumes = {name: float(np.count_nonzero(mask)) * litre for name, mask in counted.items()}
     both, (least, most) = volumes["right lung"] + volumes["left lung"], LIMITS["lungs_l"].usual
     warnings = []

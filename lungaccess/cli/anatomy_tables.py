@@ -17,16 +17,14 @@ from lungaccess.plans.record import picked
 VERDICTS = (REFUSED, ACCEPTED, DOUBTFUL, FITS)
 """In this order checks are shown: what has to be looked at comes first."""
 MOTION_WORDS = {
-    "landmark_pairs": "pairs of landmarks",
-    "residual_mm": "left at the source's points, mean, mm",
+    "landmark_pairs": "pairs of landmarks", "residual_mm": "left at the source's points, mean, mm",
     "residual_95_mm": "left at the source's points, 95 %, mm",
     "left_out_mm": "left at each half of the pairs as the other half predicts it, mean, mm",
     "left_out_95_mm": "the same, 95 %, mm",
     "to_masks_phase_mm": "left of bringing the field to the masks' phase, mm",
     "mended_share": "share of a lung in which the field slides or folds, and is continued",
     "sliding_at_pleura_mm": "difference of the field 5 mm inside and outside of the pleura, mm",
-    "right_95_mm": "motion of the right lung, 95 %, mm",
-    "left_95_mm": "motion of the left lung, 95 %, mm",
+    "right_95_mm": "motion of the right lung, 95 %, mm", "left_95_mm": "motion of the left lung, 95 %, mm",
     "right_base_to_feet_mm": "base of the right lung to the feet, mean, mm",
     "left_base_to_feet_mm": "base of the left lung to the feet, mean, mm",
     "least_stretch": "proved: no length becomes shorter than this share of itself",
@@ -35,7 +33,7 @@ MOTION_WORDS = {
     "lungs_dice": "Dice of the moved lungs with other_lungs",
     "lungs_dice_unmoved": "the same of the lungs as they are",
     "lungs_borders_mm": "distance of the borders of moved and other lungs, mean, mm",
-}
+}  # fmt: skip
 """The figures of a motion in words, see `anatomy.motion`."""
 
 if TYPE_CHECKING:

@@ -30,16 +30,10 @@ DRAWS, SIMULATED = 2000, 250
 PASSES = 3
 """So many passes are tried."""
 KNOWN = {
-    "scope_position": 0.5,
-    "scope_direction": 0.5,
-    "tube_rotation": 1.0,
-    "tube_insertion": 0.2,
-    "needle_curvature": 0.05,
-    "needle_roll": 2.0,
-    "needle_insertion": 0.3,
-    "target_position": 0.5,
+    "scope_position": 0.5, "scope_direction": 0.5, "tube_rotation": 1.0, "tube_insertion": 0.2,
+    "needle_curvature": 0.05, "needle_roll": 2.0, "needle_insertion": 0.3, "target_position": 0.5,
     "breathing": 1.0,
-}
+}  # fmt: skip
 """Sizes of errors that careful calibration or tracking is taken to reach, an assumption of each kind, in mm,
 degrees or, of the curvature, its logarithm."""
 

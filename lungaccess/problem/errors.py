@@ -13,28 +13,15 @@ from stages.scope import WallContact
 
 CURVATURE, BREATHING, VESSEL_BORDER = "needle_curvature", "breathing", "vessel_border"
 UNITS: dict[str, str] = {
-    "scope_position": "mm",
-    "scope_direction": "deg",
-    "tube_rotation": "deg",
-    "tube_insertion": "mm",
-    CURVATURE: "ln",
-    "needle_roll": "deg",
-    "needle_insertion": "mm",
-    "target_position": "mm",
-    BREATHING: "mm",
+    "scope_position": "mm", "scope_direction": "deg", "tube_rotation": "deg", "tube_insertion": "mm",
+    CURVATURE: "ln", "needle_roll": "deg", "needle_insertion": "mm", "target_position": "mm", BREATHING: "mm",
     VESSEL_BORDER: "mm",
-}
+}  # fmt: skip
 """Kinds of error and the unit in which their size is stated; "ln" is the natural logarithm of a factor."""
 AXES: dict[str, int] = {
-    "scope_position": 3,
-    "scope_direction": 2,
-    "tube_rotation": 1,
-    "tube_insertion": 1,
-    "needle_roll": 1,
-    "needle_insertion": 1,
-    "target_position": 3,
-    VESSEL_BORDER: 1,
-}
+    "scope_position": 3, "scope_direction": 2, "tube_rotation": 1, "tube_insertion": 1, "needle_roll": 1,
+    "needle_insertion": 1, "target_position": 3, VESSEL_BORDER: 1,
+}  # fmt: skip
 """How many numbers the bias of a kind has: along x, y, z of the scope's tip, about its x and y, LPS for the
 target, one where the devices have one axis, and one for the vessels' border.  The curvature has its median
 instead."""

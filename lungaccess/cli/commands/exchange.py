@@ -159,27 +159,18 @@ Kind = Literal[
     "plan",
 ]  # fmt: skip
 FILES = {
-    "patient": "patient.toml",
-    "errors": "errors.toml",
-    "procedure": "procedure.toml",
-    "study": "study.toml",
-    "design": "design.toml",
-    "tubes": "tubes.toml",
-    "lesions": "lesions.txt",
-    "pose": "pose.txt",
+    "patient": "patient.toml", "errors": "errors.toml", "procedure": "procedure.toml", "study": "study.toml",
+    "design": "design.toml", "tubes": "tubes.toml", "lesions": "lesions.txt", "pose": "pose.txt",
     "contours": "contours.json",
-}
+}  # fmt: skip
 """The file of each kind among the templates."""
 SCHEMAS = {
-    "patient": "anatomy.io.own_masks:PatientFile",
-    "errors": "lungaccess.problem.errors:ErrorModel",
+    "patient": "anatomy.io.own_masks:PatientFile", "errors": "lungaccess.problem.errors:ErrorModel",
     "procedure": "lungaccess.problem.procedures:Procedure",
-    "study": "lungaccess.running.study.settings:Study",
-    "design": "lungaccess.running.study.settings:Study",
-    "tubes": "lungaccess.planning.one_stage.tubes:BareTubes",
-    "device": "lungaccess.problem.system:System",
+    "study": "lungaccess.running.study.settings:Study", "design": "lungaccess.running.study.settings:Study",
+    "tubes": "lungaccess.planning.one_stage.tubes:BareTubes", "device": "lungaccess.problem.system:System",
     "plan": "lungaccess.plans.plan:Plan",
-}
+}  # fmt: skip
 """The class that reads the files of a kind: its fields are their keys, besides those of `FURTHER`."""
 TEXT = {"type": "string"}
 FURTHER: dict[str, dict[str, Any]] = {

@@ -58,13 +58,9 @@ def grade_of_chance(success: Share | None) -> Grade:
 
 
 FAILURES = {
-    "vessel": "touches a vessel",
-    "pleura": "touches the pleura",
-    "fissure": "touches a fissure",
-    "airway": "touches an airway",
-    "stays in the airway": "stays in the airway",
-    NO_PATH: "has no path left",
-}
+    "vessel": "touches a vessel", "pleura": "touches the pleura", "fissure": "touches a fissure",
+    "airway": "touches an airway", "stays in the airway": "stays in the airway", NO_PATH: "has no path left",
+}  # fmt: skip
 """The failures in words, by the names of `lungaccess.uncertainty.risk.STRUCTURES` and `NO_PATH`."""
 
 BESIDE_TARGET = (

@@ -25,7 +25,7 @@ from lungaccess.problem.errors import ErrorModel
 from lungaccess.problem.procedures import Procedure
 from lungaccess.problem.system import System
 from lungaccess.uncertainty.risk import Deviations
-from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tubes_alone
+from lungaccess.uncertainty.risk.deviations import DeviatedPlan, in_rows, no_deviations, tube_values
 from stages.needle import needle_environment, workspace_lengths
 from stages.tube import Deployment, DeploymentValidator, SiteEnumerator
 
@@ -197,9 +197,10 @@ def with_choices(planned: Choices, system: System, made: list[Deployment], frame
     tips = [np.linalg.inv(frame) @ each.lps_from_tip for frame, each in zip(frames, made, strict=True)]
     tubes = planned.tubes
     if system.tubes.planar:
+        outer_mm = [0.0 if system.tubes.outer is None else each.outer_mm for each in made]
         own = [
-            tubes_alone(system.tubes, frame, (each.rotation_rad, each.outer_mm, each.inner_mm)).tubes
-            for frame, each in zip(frames, made, strict=True)
+            tube_values(system.tubes, e.rotation_rad, o, e.inner_mm)
+            for o, e in zip(outer_mm, made, strict=True)
         ]
         tubes = np.concatenate([planned.tubes, own])
     arcs = [planned.shapes[0], *(np.asarray(each.shape.arcs) for each in made)]

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from anatomy.base.errors import SettingsError
-from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
 from anatomy.motion.source import share_of_motion
@@ -19,7 +18,6 @@ from lungaccess.plans.tissue import goal_radius, wanted_of
 from lungaccess.problem.errors import OF_NEEDLE, UNITS, ErrorModel
 from lungaccess.uncertainty.risk.deviations import DeviatedPlan, Deviations, Draws, judging, no_deviations
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
-from lungaccess.uncertainty.risk.kernels.chain import Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import find_outcomes, find_taken, follow_chains, keep_clear
 from lungaccess.uncertainty.risk.patient_errors import PatientMotion
 from lungaccess.uncertainty.risk.statistics import Share, share_of
@@ -38,8 +36,7 @@ THREADS = 2
 """The kernel holds no lock, and two cores are the least that a machine of today has."""
 
 
-@frozen_record
-class Outcomes:
+class Outcomes(NamedTuple):
     """What became of N deviated plans, `(N,)` each.
 
     Args:
@@ -53,6 +50,11 @@ class Outcomes:
     miss_mm: Float
     taken: Float
     ends: Float
+
+    @classmethod
+    def unknown(cls, count: int) -> Self:
+        """Return arrays for the outcomes of so many plans, which a kernel fills."""
+        return cls(np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count), np.zeros((count, 9)))
 
 
 def taken_together(taken: Sequence[Float] | Float, wanted: Wanted) -> Float:
@@ -160,38 +162,23 @@ class RiskAssessor:
 
     def _of_first(self, deviations: Deviations) -> Outcomes:
         """Follow the first pass of deviated plans."""
-        count = deviations.count
-        touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
-        ends = np.zeros((count, 9))
-        inputs = self._inputs(deviations)
+        inputs, found = self._inputs(deviations), Outcomes.unknown(deviations.count)
 
         def find(part: slice) -> None:
-            find_outcomes(
-                *inputs,
-                self._obstacles,
-                self.wanted,
-                part.start,
-                touched[part],
-                miss_mm[part],
-                taken[part],
-                ends[part],
-            )
+            own = (each[part] for each in found)
+            find_outcomes(*inputs, self._obstacles, self.wanted, part.start, *own)
 
-        in_threads(find, count)
-        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
+        in_threads(find, deviations.count)
+        return found
 
     def follow(
         self, starts: Float, pieces: Float, n_tube: int, target_mm: Float, border_mm: Float
     ) -> Outcomes:
         """Return what becomes of chains whose target has moved, `(N, 3)`; see `Outcomes` and `Deviations`."""
-        count = len(starts)
-        touched, miss_mm, taken = np.zeros(count, dtype=np.int64), np.zeros(count), np.zeros(count)
-        ends = np.zeros((count, 9))
-        follow_chains(
-            starts, pieces, n_tube, self._obstacles, self._judging, self.wanted,
-            np.column_stack([target_mm, border_mm]), touched, miss_mm, taken, ends,
-        )  # fmt: skip
-        return Outcomes(touched=touched, miss_mm=miss_mm, taken=taken, ends=ends)
+        found, moved = Outcomes.unknown(len(starts)), np.column_stack([target_mm, border_mm])
+        about = self._obstacles, self._judging, self.wanted
+        follow_chains(starts, pieces, n_tube, *about, moved, *found)
+        return found
 
     def _inputs(self, deviations: Deviations) -> tuple[Any, ...]:
         """Return what all kernels take first; see `find_taken`."""
@@ -239,19 +226,6 @@ class RiskAssessor:
     def _further(self, deviations: Deviations) -> Sequence[Deviations]:
         """Return the deviations of the passes after the first."""
         return deviations.further or [_fitted(each.n_arcs, deviations) for each in self._others]
-
-    def clear(self, devices: Devices, errors: Float, least_depth_mm: float) -> Bool:
-        """Tell which `(N,)` of deviated devices touch nothing forbidden, wherever they end.
-
-        Args:
-            devices: In place of those of the plan.
-            errors ((N, E) float64): See `in_rows`.
-            least_depth_mm: See `Judging`.
-        """
-        done, which = np.ones(len(errors), dtype=bool), np.zeros(len(errors), dtype=np.int64)
-        judged = self._judging._replace(least_depth_mm=least_depth_mm)
-        keep_clear(devices, errors, which, judged, self._obstacles, self._forbidden_flags, 0, done)
-        return done
 
     def success(self, draws: Draws, model: ErrorModel) -> Share:
         """Return the share of successes under a model."""

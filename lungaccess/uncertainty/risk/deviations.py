@@ -6,7 +6,7 @@ Numbers are drawn once and scaled to any error model: the same luck for every pl
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
-from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import (
     BOUNDED,
@@ -166,8 +165,10 @@ class DeviatedPlan:
         self._needle[:, 1] = np.cumsum([arc.roll_rad for arc in arcs])
         self._needle[:, 2] = [arc.curvature_per_mm for arc in arcs]
         self._needle[:, 3] = plan.system.track_radius_mm
-        twisted, tubes = not plan.system.tubes.planar, plan.system.tubes
-        self._tubes = np.zeros(0) if twisted else _tube_values(tubes, plan.tube)
+        self._tubes, tubes, tube = np.zeros(0), plan.system.tubes, plan.tube
+        if tubes.planar:
+            inserted = tube.outer_insertion_mm, tube.inner_insertion_mm
+            self._tubes = tube_values(tubes, tube.rotation_rad, *inserted, tube.lateral_sweep_mm)
 
     def kernel_inputs(self, deviations: Deviations) -> tuple[Devices, Float, Int]:
         """Return the devices, the errors in rows, and the number of each draw's shape; see `Devices`."""
@@ -189,42 +190,24 @@ def in_rows(deviations: Deviations) -> Float:
     return np.column_stack([getattr(deviations, name) for name in COLUMNS])
 
 
-def tubes_alone(
-    tubes: ConcentricTubes, lps_from_scope_tip: Float, choice: tuple[float, float, float]
-) -> Devices:
-    """Return planar tubes without needle or sweep as kernels take them: rotation in rad, insertions in mm."""
-    turned, outer, inner = choice
-    tube = Deployed(turned, 0.0 if tubes.outer is None else outer, inner, 0.0)
-    # A copy, which can be written, as of a plan's frame: for one kind of array kernels are compiled once.
-    frame, empty = np.array(lps_from_scope_tip), np.zeros((0, kernel.N_PIECE))
-    return Devices(frame, _tube_values(tubes, tube), empty, empty[None][:0], np.zeros(0), TUBE_PIECES, 0.0)
-
-
-class Deployed(NamedTuple):
-    """Rotation, insertions and sideways sweep of planar tubes, as those of a `TubeDeployment`."""
-
-    rotation_rad: float
-    outer_insertion_mm: float
-    inner_insertion_mm: float
-    lateral_sweep_mm: float
-
-
-def _tube_values(tubes: ConcentricTubes, tube: TubeDeployment | Deployed) -> Float:
+def tube_values(
+    tubes: ConcentricTubes, rotation_rad: float, outer_mm: float, inner_mm: float, sweep_mm: float = 0.0
+) -> Float:
     """Return what a kernel has to know of planar tubes `(11,)`, see `chain.Devices`."""
     longest = tubes.max_extension_mm
     outer_longest = longest if tubes.outer is None else min(longest, tubes.outer.length_mm)
     return np.array(
         [
-            tube.rotation_rad,
-            tube.outer_insertion_mm,
-            tube.inner_insertion_mm,
+            rotation_rad,
+            outer_mm,
+            inner_mm,
             longest,
             tubes.max_inner_protrusion_mm,
             tubes.inner.curved_length_mm,
             tubes.overlap_curvature_per_mm,
             tubes.free_curvature_per_mm,
-            tubes.outermost.radius_mm + tube.lateral_sweep_mm,
-            tubes.inner.radius_mm + tube.lateral_sweep_mm,
+            tubes.outermost.radius_mm + sweep_mm,
+            tubes.inner.radius_mm + sweep_mm,
             outer_longest,
         ]
     )
@@ -364,19 +347,14 @@ class Draws:
 
     def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
         """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
-        own = self._again()
+        own = self.with_numbers({})
         own.deviations(model)
         return own._made
 
     def with_numbers(self, made: dict[tuple[str, int], Float]) -> "Draws":
         """Return draws with other numbers, by kind and level as `numbers` returns them."""
-        own = self._again()
-        own._made = made
-        return own
-
-    def _again(self) -> "Draws":
         own = copy(self)
-        own._made = {}
+        own._made = made
         return own
 
     def _error(

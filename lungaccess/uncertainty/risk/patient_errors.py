@@ -10,9 +10,7 @@ border of the vessels is that which the patient's segmentation states.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -69,27 +67,21 @@ def resting_tip(plan: Plan, lung: Lung, wall: WallContact) -> TipSpread:
         shaft = RestingShaft(lumen_of(lung), plan.system.scope, wall)
         return spread_of_tip(shaft, motion, wall, np.asarray(scope.lps_from_scope_tip))
 
-    if asked not in known:
-        known[asked] = make() if lung.folder is None else _kept(plan, lung, lung.folder, wall, make)
+    if asked in known:
+        return known[asked]
+    if lung.folder is None:
+        known[asked] = make()
+    else:
+        # It is kept beside a lung of the cache: every command asks for the same plans again.
+        depends_on = {
+            "lung": lung.key, "entry": scope.lps_from_entry, "states": scope.states,
+            "tip": scope.lps_from_scope_tip, "scope": to_mapping(plan.system.scope), "wall": to_mapping(wall),
+        }  # fmt: skip
+        known[asked] = kept_record(
+            "resting", resting_format(), depends_on, TipSpread, make=make, cache=lung.folder.parent,
+            name=lung.name, in_use=(lung.folder,),
+        )  # fmt: skip
     return known[asked]
-
-
-def _kept(
-    plan: Plan, lung: Lung, folder: Path, wall: WallContact, make: Callable[[], TipSpread]
-) -> TipSpread:
-    """Return what is kept of a motion in a lung of the cache: every command asks for the same plans again."""
-    depends_on = {
-        "lung": lung.key,
-        "entry": plan.scope.lps_from_entry,
-        "states": plan.scope.states,
-        "tip": plan.scope.lps_from_scope_tip,
-        "scope": to_mapping(plan.system.scope),
-        "wall": to_mapping(wall),
-    }
-    return kept_record(
-        "resting", resting_format(), depends_on, TipSpread, make=make, cache=folder.parent, name=lung.name,
-        in_use=(folder,),
-    )  # fmt: skip
 
 
 @frozen_value
@@ -113,34 +105,28 @@ def resting_rows(spread: TipSpread, wall: WallContact) -> tuple[RestingRow, ...]
     """Return what the shaft at rest does to a plan, for people."""
     off, nominal, other = spread.nominal_off, spread.nominal, spread.other
     forces = [nominal.wall_force_n, *spread.wall_force_n.tolist()]
-    spread_mm, spread_deg = (
-        math.hypot(spread.patient_mm, spread.attempt_mm),
-        math.hypot(spread.patient_deg, spread.attempt_deg),
-    )
-    rows = [
-        RestingRow(name="tip off its planned place", value=_length(off[:3]), unit="mm"),
-        RestingRow(name="tip turned", value=_length(off[3:]), unit="deg"),
-        RestingRow(name="bias of the place", value=_length(spread.bias_mm), unit="mm"),
-        RestingRow(name="bias of the direction", value=_length(spread.bias_deg), unit="deg"),
-        RestingRow(name="spread of the place along an axis", value=spread_mm, unit="mm"),
-        RestingRow(name="spread of the direction about an axis", value=spread_deg, unit="deg"),
-        RestingRow(
-            name="force on 10 mm of wall", value=nominal.wall_force_n, unit="N", limit=wall.max_wall_force_n
-        ),
-        RestingRow(name="the same, at most", value=max(forces), unit="N", limit=wall.max_wall_force_n),
-        RestingRow(
-            name="wall pressed in", value=nominal.most_give_mm, unit="mm", limit=wall.max_wall_give_mm
-        ),
-        RestingRow(name="at rest with the tip at its depth", value=100.0 * spread.held_share, unit="%"),
+    spread_mm = math.hypot(spread.patient_mm, spread.attempt_mm)
+    spread_deg = math.hypot(spread.patient_deg, spread.attempt_deg)
+    rows: list[tuple[str, float, str, float | None]] = [
+        ("tip off its planned place", _length(off[:3]), "mm", None),
+        ("tip turned", _length(off[3:]), "deg", None),
+        ("bias of the place", _length(spread.bias_mm), "mm", None),
+        ("bias of the direction", _length(spread.bias_deg), "deg", None),
+        ("spread of the place along an axis", spread_mm, "mm", None),
+        ("spread of the direction about an axis", spread_deg, "deg", None),
+        ("force on 10 mm of wall", nominal.wall_force_n, "N", wall.max_wall_force_n),
+        ("the same, at most", max(forces), "N", wall.max_wall_force_n),
+        ("wall pressed in", nominal.most_give_mm, "mm", wall.max_wall_give_mm),
+        ("at rest with the tip at its depth", 100.0 * spread.held_share, "%", None),
     ]
     if other is not None:
         apart = off_pose(nominal.lps_from_scope_tip, other.lps_from_scope_tip)
         what = "another shape at rest" if other.settled else "slips if it came with a straight section"
-        rows += [
-            RestingRow(name=f"{what}: tip apart", value=_length(apart[:3]), unit="mm"),
-            RestingRow(name=f"{what}: tip turned", value=_length(apart[3:]), unit="deg"),
-        ]
-    return tuple(rows)
+        rows += [(f"{what}: tip apart", _length(apart[:3]), "mm", None)]
+        rows += [(f"{what}: tip turned", _length(apart[3:]), "deg", None)]
+    return tuple(
+        RestingRow(name=name, value=value, unit=unit, limit=most) for name, value, unit, most in rows
+    )
 
 
 def _length(vector: Float) -> float:

@@ -45,8 +45,7 @@ def place_of(plan: Plan, place: StatedPlace) -> Float:
 def place_part(request: Request, atlas: Atlas) -> Atlas:
     """Return the part of an atlas whose deployments go through the stated place, all of it without one.
 
-    Raises:
-        TargetError: If there is none: says how far the nearest one is.
+    TargetError is raised if there is none: says how far the nearest one is.
     """
     place = request.place
     if place is None:

@@ -43,10 +43,8 @@ def parallel_steps(search: ParallelSearch, processes: int) -> Iterator[Step]:
     The direct steps come first.  Then rounds: each process continues a search of its own, which begins from
     every so many of the direct ways and has random numbers that depend on the seed and its number, and the
     best of all goes into the next round.  So the same seed, number of processes and iterations give the same
-    plans, whatever the machine's load.
-
-    Raises:
-        SettingsError: If there are fewer than two processes, or this system cannot fork.
+    plans, whatever the machine's load.  SettingsError is raised if there are fewer than two processes, or
+    this system cannot fork.
     """
     if processes < 2 or not can_fork():
         raise SettingsError(
@@ -118,8 +116,7 @@ def planners() -> dict[str, SearchFactory]:
 def register_planner(name: str, search: SearchFactory) -> None:
     """Make a search known by its name in this process; a package does so by an entry point.
 
-    Raises:
-        SettingsError: If the name is that of a search of this package.
+    SettingsError is raised if the name is that of a search of this package.
     """
     if name in (ATLAS, *NEED_A_NEEDLE):
         raise SettingsError(f"A planner cannot be called {name!r}", expected="a name of its own")

@@ -95,8 +95,7 @@ def read_lesions(path: str | Path) -> Float:
 def lesions_of(lung: Lung) -> Float:
     """Return the targets that came with a patient, `(M, 3)` LPS mm.
 
-    Raises:
-        TargetError: If none came with it, or more than 62.
+    TargetError is raised if none came with it, or more than 62.
     """
     count = len(lung.targets_lps)
     if not 1 <= count <= MOST_LESIONS:
@@ -123,7 +122,8 @@ def plan_tour(
     """Plan the shortest tour to all lesions `(M, 3)`, LPS mm, and the one by least resistance beside it.
 
     A lesion without an exit is left out of the tour, and named in the answer.  That no plan was found does
-    not prove that there is none.
+    not prove that there is none.  TargetError is raised if a lesion lies outside the image, or none has an
+    exit.
 
     Args:
         rule: By default the paper's reach of 40 mm, or with an atlas that of tubes and needle together.
@@ -131,9 +131,6 @@ def plan_tour(
         tissue_weight: How many mm of the scope's travel a mm between exit and lesion is worth.
         atlas: If given, an exit counts only if a coupled plan from there was found: see `coupled_plan_test`.
         iterations: Of the coupled planner for a lesion that no direct arc reaches; 0 for direct arcs alone.
-
-    Raises:
-        TargetError: If a lesion lies outside the image, or none has an exit.
     """
     lesions = np.asarray(lesions_lps, dtype=np.float64).reshape(-1, 3)
     for number, inside in enumerate(lung.grid.contains(lesions).tolist(), 1):

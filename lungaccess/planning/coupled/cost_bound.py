@@ -40,14 +40,12 @@ class CostBound:
 
     The bound holds for every deployment from a scope tip of the atlas, with any rotation and any insertions
     of the tubes, and for every path of the needle from there to the target.  Of other scope tips, which the
-    planner tries along the motions between those of the atlas, it says nothing.
+    planner tries along the motions between those of the atlas, it says nothing.  SettingsError is raised if
+    the tubes are not planar, there is no needle, or it is longer than half a circle of its greatest
+    curvature.
 
     Args:
         beside_mm: How far beside the target the needle may end.
-
-    Raises:
-        SettingsError: If the tubes are not planar, there is no needle, or it is longer than half a circle of
-            its greatest curvature.
     """
 
     def __init__(self, task: Task, atlas: Atlas, *, beside_mm: float = 0.0) -> None:

@@ -187,8 +187,7 @@ def guided(search: AtlasSearch, steps: Iterator[Step], bound: LowerBound) -> Ite
 class GapGoal:
     """The goal that a plan costs at most a share `gap` more than the best possible, proved.
 
-    Raises:
-        SettingsError: If the gap is negative or not finite.
+    SettingsError is raised if the gap is negative or not finite.
     """
 
     def __init__(self, bound: LowerBound, gap: float) -> None:

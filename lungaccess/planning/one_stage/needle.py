@@ -390,8 +390,7 @@ class NeedleQuestion:
 def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
     """Ask for a path of a system's needle, with its margins, and the exemption that its start `(4, 4)` has.
 
-    Raises:
-        TargetError: If the target (LPS mm) is the point of the start.
+    TargetError is raised if the target (LPS mm) is the point of the start.
     """
     # The searches take no shorter arc.
     if np.linalg.norm(lps_from_start[:3, 3] - target_lps) < 1e-6:

@@ -34,10 +34,8 @@ class RouteSource:
     def place(self, text: str, needed_mm: float = 0.0) -> Float:
         """Return a point `(3,)` LPS mm: one with its frame, or the place in the lumen nearest to a named one.
 
-        The lumen is at least `needed_mm` deep there, if it is so anywhere.
-
-        Raises:
-            FrameError: If the text is neither a name nor a point with its frame.
+        The lumen is at least `needed_mm` deep there, if it is so anywhere.  FrameError is raised if the text
+        is neither a name nor a point with its frame.
         """
         named = {name.lower(): point for name, point in self.places.items()}
         if text.lower() not in named:
@@ -132,9 +130,7 @@ def read_drawing(path: Path) -> Any:
     """Read a picture of vessels, `(rows, columns)` bool: true where it is darker than half the range.
 
     Where more than half of it would be vessel, the picture is taken for a bright drawing on dark ground.
-
-    Raises:
-        FileError: If it cannot be read.
+    FileError is raised if it cannot be read.
     """
     from skimage.io import imread
 

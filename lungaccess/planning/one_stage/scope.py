@@ -105,8 +105,7 @@ def advise_scope(
 def save_advice(advice: ScopeAdvice, folder: Path) -> None:
     """Write the advice, and the camera's flight as a curve for 3D Slicer, into a folder.
 
-    Raises:
-        FileError: If the folder is missing or not writable.
+    FileError is raised if the folder is missing or not writable.
     """
     contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
     for name, content in contents.items():

@@ -107,8 +107,7 @@ class TubeAnswer:
 def load_tubes(name_or_path: str | os.PathLike[str]) -> System | BareTubes:
     """Read a system, or a TOML file that holds just a name and tables `[[tubes]]`, the innermost first.
 
-    Raises:
-        SettingsError, FileError: As `lungaccess.problem.system.load_system`.
+    Errors are those of `lungaccess.problem.system.load_system`.
     """
     given = os.fspath(name_or_path)
     if given.endswith(".toml"):
@@ -129,10 +128,8 @@ def deploy_tubes(
     """Turn, insert both tubes, insert the inner one, and look at every step.
 
     The direction of the inner tube's bend about +z of the scope tip is `rotation_rad` from its +x, as in a
-    plan, and the base of the outer tube is turned `relative_rad` farther.
-
-    Raises:
-        SettingsError: If the insertions are impossible, nothing comes out, or an angle is more than a turn.
+    plan, and the base of the outer tube is turned `relative_rad` farther.  SettingsError is raised if the
+    insertions are impossible, nothing comes out, or an angle is more than a turn.
     """
     tubes = tubes_of(device)
     if len(tubes) != 2:
@@ -189,10 +186,8 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     """Return the present design, and one proposal for each curved length, the least sweep first.
 
     Of each length it is the design with the least sweep that reaches about as far to the side as the present
-    one, or else the one that reaches farthest.  None sweeps more than the system allows.
-
-    Raises:
-        SettingsError: If the tubes are no system: its limits are needed.
+    one, or else the one that reaches farthest.  None sweeps more than the system allows.  SettingsError is
+    raised if the tubes are no system: its limits are needed.
     """
     system = answer.system
     if system is None:
@@ -261,8 +256,7 @@ def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
 def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
     """Return the shapes of a design, from the cache if they are there; bare tubes have default limits.
 
-    Raises:
-        SettingsError, FileError: As `stages.tube.open_shapes`.
+    Errors are those of `stages.tube.open_shapes`.
     """
     limits, needle = ShapeLimits(), None
     if isinstance(device, System):
@@ -307,8 +301,7 @@ def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
 def save_shapes(shapes: TubeShapes, path: Path) -> None:
     """Write a table of all shapes as CSV: insertions and rotations from the innermost tube, tip, and costs.
 
-    Raises:
-        FileError: If the file cannot be written.
+    FileError is raised if the file cannot be written.
     """
     n = len(shapes.tubes)
     columns = {

@@ -129,15 +129,13 @@ class OnTheWay(NamedTuple):
 class Policy:
     """Tells what to do next in a procedure that carries out a plan; what it prepares serves all answers.
 
-    Measurements are weighed by the errors against what was expected.
+    Measurements are weighed by the errors against what was expected.  PlanFileError and SettingsError are
+    raised as by `RiskAssessor`.
 
     Args:
         errors: The preset `breath-hold` if None.
         procedure: The preset `open-loop` if None: then nothing is measured, and nothing to decide.
         radius_mm: Radius of the goal; see `RiskAssessor`.
-
-    Raises:
-        PlanFileError, SettingsError: See `RiskAssessor`.
     """
 
     def __init__(

@@ -92,10 +92,8 @@ def simulate_procedure(
     needle is inserted, blindly or measured on its way.  After each measurement `Policy`, whose parameters
     these are, says what to do next.  What the devices then really did is looked at by the kernel of `assess`.
     The same seed gives the same report, whatever the number of processes, which is one where the system
-    cannot fork; without measuring it is that of `assess` with these draws.
-
-    Raises:
-        PlanFileError, SettingsError: See `RiskAssessor`; also if there are no samples or processes.
+    cannot fork; without measuring it is that of `assess` with these draws.  PlanFileError and SettingsError
+    are raised as by `RiskAssessor`, also if there are no samples or processes.
     """
     return simulated(Policy(plan, lung, errors, procedure, radius_mm=radius_mm), samples, seed, processes)
 

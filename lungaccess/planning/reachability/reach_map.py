@@ -158,8 +158,7 @@ class ReachMap:
     def gained_and_lost_ml(self, other: "ReachMap") -> tuple[float, float]:
         """Return the volume that this map reaches and another does not, and the reverse.
 
-        Raises:
-            GridMismatchError: If the maps are not on the same grid.
+        GridMismatchError is raised if the maps are not on the same grid.
         """
         self.kinds.grid.require_same(other.kinds.grid, "the other map")
         ml = self.kinds.grid.voxel_volume_mm3 / 1000.0
@@ -183,10 +182,8 @@ class ReachMap:
         """Write the map as four images, five with phases, that 3D Slicer opens in the patient's frame.
 
         `STEM.nrrd` holds the kinds as labels, `STEM-cost.nrrd`, `STEM-clearance.nrrd` and
-        `STEM-deployment.nrrd` the rest, `STEM-window.nrrd` the share of the breath.
-
-        Raises:
-            FileError: If the folder cannot be written to.
+        `STEM-deployment.nrrd` the rest, `STEM-window.nrrd` the share of the breath.  FileError is raised if
+        the folder cannot be written to.
         """
         place = require_writable_folder(Path(folder))
         volumes = {"": self.kinds, "-cost": self.cost, "-clearance": self.clearance_mm}
@@ -201,8 +198,7 @@ class ReachMap:
 def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
     """Return the grid of cubes of `spacing_mm` along the axes of a lung's grid that covers it.
 
-    Raises:
-        SettingsError: If the spacing is not between 0.5 and 50 mm.
+    SettingsError is raised if the spacing is not between 0.5 and 50 mm.
     """
     if not 0.5 <= spacing_mm <= 50.0:
         raise SettingsError(
@@ -338,9 +334,7 @@ class ReachStream:
     """Tells which points of a coarse grid a system reaches by single arcs, part by part.
 
     `counted` (M,) are numbers of the voxels whose centre lies in lung tissue that is no obstacle.
-
-    Raises:
-        SettingsError: If the atlas belongs to another lung or system.
+    SettingsError is raised if the atlas belongs to another lung or system.
     """
 
     def __init__(self, lung: Lung, system: System, atlas: Atlas) -> None:

@@ -148,14 +148,12 @@ class UnreachableProof:
     obstacle, but its tip and the target must lie in the same free region.  Without a needle the tip of the
     tubes itself must come to the target.
 
-    Deployments that no target needs to look at are ruled out once, with the first target.
+    Deployments that no target needs to look at are ruled out once, with the first target.  SettingsError is
+    raised if the tubes are not planar.
 
     Args:
         between: Called between the steps of the preparation, in patients tens of seconds; it may raise to end
             it.
-
-    Raises:
-        SettingsError: If the tubes are not planar.
     """
 
     def __init__(
@@ -223,15 +221,13 @@ class UnreachableProof:
         """Try to prove that no deployment reaches the target.
 
         The places nearest to the target are looked at first.  After one that is left open the search goes on
-        with the others, then with what else can be ruled out around the open ones.
+        with the others, then with what else can be ruled out around the open ones.  TargetError is raised if
+        the target is not a finite point of the image.
 
         Args:
             target_lps ((3,) float64): LPS mm.
             most_boxes: To look at, about.
             time_s: After so much time nothing more is begun; the same time need not give the same verdict.
-
-        Raises:
-            TargetError: If the target is not a finite point of the image.
         """
         target = np.asarray(target_lps, dtype=np.float64)
         environment = self._environment(target)

@@ -32,13 +32,12 @@ def estimate_success(
 ) -> RiskReport | ProcedureReport:
     """Return how often a plan succeeds: deviated as it stands in open loop, else by simulated procedures.
 
+    PlanFileError and SettingsError are raised as by `lungaccess.uncertainty.risk.RiskAssessor`, also if there
+    are no samples.
+
     Args:
         each_kind: See `lungaccess.uncertainty.risk.assess`; of open loop alone.
         processes: How many share the work of simulated procedures; the estimate is the same.
-
-    Raises:
-        PlanFileError, SettingsError: See `lungaccess.uncertainty.risk.RiskAssessor`; also if there are no
-            samples.
     """
     if procedure.is_open_loop:
         return assess(

@@ -84,8 +84,7 @@ def why_no_query(patient: PatientImages | LiverImages | Organ) -> str:
 def patients_of(folder: Path) -> list[Path]:
     """Return the patients that a folder holds, or itself if it is one, in the order of their numbers.
 
-    Raises:
-        FileError: If the folder is not there, or is no patient and holds none.
+    FileError is raised if the folder is not there, or is no patient and holds none.
     """
     from anatomy.io.images import image_suffix
 
@@ -200,8 +199,7 @@ class PeerResult:
 def read_peer(path: Path) -> Mapping[Key, PeerResult]:
     """Read recorded results: runs of one thread that ignore obstacles within 3 mm of the start.
 
-    Raises:
-        FileError: If the file cannot be read or holds something else.
+    FileError is raised if the file cannot be read or holds something else.
     """
     try:
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]

@@ -181,8 +181,7 @@ def require_table_file(path: Path) -> None:
 def write_rows(rows: Iterable[BenchmarkRow], path: Path) -> None:
     """Write the rows by the suffix of the file; what is not known stays empty, or null; a table has no arcs.
 
-    Raises:
-        FileError: If the file cannot be written, or ends in something else.
+    FileError is raised if the file cannot be written, or ends in something else.
     """
     require_table_file(path)
     records = [asdict(row) for row in rows]

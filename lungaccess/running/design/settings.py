@@ -119,8 +119,7 @@ def read_design(path: str | os.PathLike[str]) -> Design:
 def design_of(content: Mapping[str, Any], where: str = "design", folder: str = ".") -> Design:
     """Return the search that plain values describe: those of a study, and a table `design`.
 
-    Raises:
-        SettingsError: If a key is unknown, missing or wrong.
+    SettingsError is raised if a key is unknown, missing or wrong.
     """
     values = {"planner": [{"name": "atlas"}], **content}
     own = values.pop("design", None)
@@ -170,8 +169,7 @@ def near(system: System, numbers: Sequence[Number], even: Sequence[float], radiu
 def device(base: System, numbers: Sequence[Number], point: Sequence[float]) -> System:
     """Return the system at a point of the cube, named by what it changes, which its sources call assumed.
 
-    Raises:
-        SettingsError: If the validator of devices refuses it.
+    SettingsError is raised if the validator of devices refuses it.
     """
     changes: dict[str, Any] = {}
     for number, x in zip(numbers, point, strict=True):

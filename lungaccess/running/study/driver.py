@@ -285,10 +285,8 @@ def each_done(
     """Yield each piece of work with what became of it, in the order in which they end.
 
     `work` receives a piece and `more`, on a worker; what became of it is what it returned, or the error that
-    it raised at every try.  Only a few pieces wait at the scheduler at any time.
-
-    Raises:
-        StudyError: If the scheduler is lost.
+    it raised at every try.  Only a few pieces wait at the scheduler at any time.  StudyError is raised if the
+    scheduler is lost.
     """
     from distributed import as_completed
 

@@ -73,9 +73,8 @@ class Opened(NamedTuple):
 def answer(run: Run, cache: Path | None = None) -> Answer:
     """Make a run and return what it ended with.
 
-    Raises:
-        FileError: If a file cannot be read or written here; whatever else is not the run's own answer is
-            raised, too.
+    FileError is raised if a file cannot be read or written here; whatever else is not the run's own answer is
+    raised, too.
     """
     if run.planner.own_process or run.planner.is_of_ompl:
         return _in_own_process(run, cache)
@@ -85,8 +84,7 @@ def answer(run: Run, cache: Path | None = None) -> Answer:
 def prepare(problem: Problem, cache: Path | None = None) -> None:
     """Make sure that the cache has the patient and the atlas of a problem, unless its device allows none.
 
-    Raises:
-        LungaccessError: If the patient cannot be read or the cache cannot be written.
+    LungaccessError is raised if the patient cannot be read or the cache cannot be written.
     """
     with _one_at_a_time:
         numba.set_num_threads(1)

@@ -20,14 +20,11 @@ from stages.needle import TERMS
 class ResultsFile:
     """A results file, open for reading and adding; for a `with` statement.
 
-    Several processes may have the same file open.
+    Several processes may have the same file open.  FileError is raised if the file is not there, cannot be
+    written, is damaged, or is not a results file of this format.
 
     Args:
         create: Whether a file that is not there is made.
-
-    Raises:
-        FileError: If the file is not there, cannot be written, is damaged, or is not a results file of this
-            format.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
@@ -92,11 +89,7 @@ class ResultsFile:
         return int(self._connection.execute(f"PRAGMA {pragma}").fetchone()[0])
 
     def rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of a query.
-
-        Raises:
-            FileError: If the file cannot be read.
-        """
+        """Yield the rows of a query; FileError if the file cannot be read."""
         with file_errors(self.path):
             cursor = self._connection.execute(query, values)
         while True:
@@ -109,11 +102,7 @@ class ResultsFile:
             yield from batch
 
     def columns(self, query: str) -> tuple[str, ...]:
-        """Return the names of the columns of a query.
-
-        Raises:
-            FileError: If the file cannot be read.
-        """
+        """Return the names of the columns of a query; FileError if the file cannot be read."""
         with file_errors(self.path):
             found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
         return tuple(each[0] for each in found)
@@ -132,10 +121,8 @@ class ResultsFile:
     def add(self, run: Run, answer: Answer) -> bool:
         """Store what a run ended with, all of it or nothing; return whether it was new.
 
-        A run that is there already stays as it is, unless it failed.
-
-        Raises:
-            FileError: If the disk is full, another program holds the file for too long, or it is damaged.
+        A run that is there already stays as it is, unless it failed.  FileError is raised if the disk is
+        full, another program holds the file for too long, or it is damaged.
         """
         with file_errors(self.path), self._transaction() as connection:
             connection.execute(

@@ -50,8 +50,7 @@ class Patient:
 def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
     """Return the patient of a case; a relative folder is relative to `folder`.
 
-    Raises:
-        LungaccessError: If the patient cannot be read.
+    LungaccessError is raised if the patient cannot be read.
     """
     from anatomy.io.inputs import input_hashes
 
@@ -198,9 +197,8 @@ def runs_of(
 ) -> Iterator[Run]:
     """Yield the runs of a study, case by case; each patient is opened once to find the targets.
 
-    Raises:
-        LungaccessError: If a patient or a system cannot be read, a target cannot be understood, there is no
-            such nodule, or a planner needs a needle that a system does not have.
+    LungaccessError is raised if a patient or a system cannot be read, a target cannot be understood, there is
+    no such nodule, or a planner needs a needle that a system does not have.
     """
     for case in study.case:
         (progress or (lambda _words: None))(f"targets of {case.name}")

@@ -88,11 +88,7 @@ class Table(NamedTuple):
 
 
 def table(results: ResultsFile, name: str) -> Table:
-    """Return one of the tables of `QUERIES`.
-
-    Raises:
-        FileError: If the file cannot be read.
-    """
+    """Return one of the tables of `QUERIES`; FileError if the file cannot be read."""
     columns = results.columns(QUERIES[name])
     return Table(columns, results.rows(QUERIES[name]))
 
@@ -101,10 +97,7 @@ def differences(first: Path, second: Path) -> list[str]:
     """Compare every row of two results files, but for times and memory; return at most `MOST` differences.
 
     Runs, costs over iterations, findings, rejections and plans are compared value by value; a number must be
-    the same to the last bit.
-
-    Raises:
-        FileError: If a file cannot be read.
+    the same to the last bit.  FileError is raised if a file cannot be read.
     """
     found: list[str] = []
     with ResultsFile(first) as one, ResultsFile(second) as two:
@@ -140,8 +133,7 @@ def _short(row: tuple[Any, ...]) -> str:
 def export_csv(path: Path, folder: Path) -> list[Path]:
     """Write the tables of a results file as CSV with a heading, numbers without loss; return the files.
 
-    Raises:
-        FileError: If the results cannot be read or the folder cannot be written.
+    FileError is raised if the results cannot be read or the folder cannot be written.
     """
     return _export(path, folder, ".csv", _write_csv)
 
@@ -167,8 +159,7 @@ def _write_csv(content: Table, path: Path) -> None:
 def export_parquet(path: Path, folder: Path) -> list[Path]:
     """Write the tables of a results file as Parquet; parameters and errors as those of `export_csv`.
 
-    Raises:
-        StudyError: If pyarrow is not installed.
+    StudyError is raised if pyarrow is not installed.
     """
     try:
         import pyarrow.parquet  # noqa: F401
@@ -241,11 +232,7 @@ class Group:
 
 
 def summarise(path: Path) -> list[Group]:
-    """Summarise a results file by case, objective and planner.
-
-    Raises:
-        FileError: If the file cannot be read.
-    """
+    """Summarise a results file by case, objective and planner; FileError if the file cannot be read."""
     groups: dict[tuple[str, str, str], list[tuple[Any, ...]]] = {}
     with ResultsFile(path) as results:
         for case, objective, planner, *values in results.rows(_QUERY):

@@ -317,7 +317,8 @@ def assess(
 ) -> RiskReport:
     """Return how likely a plan succeeds, and what it may touch, if the devices deviate from it.
 
-    The plan's own system is deployed, in the lung that the plan was made for.
+    The plan's own system is deployed, in the lung that the plan was made for.  PlanFileError and
+    SettingsError are raised as by `RiskAssessor`, also if there are no samples.
 
     Args:
         model: The preset `breath-hold` if None.  Where the patient's own breathing is known, it is that which
@@ -326,9 +327,6 @@ def assess(
         radius_mm: Radius of the goal; see `RiskAssessor`.
         each_kind: Whether success under errors of one kind only, sensitivities and rare touches are
             estimated, too: some thirty times the work.
-
-    Raises:
-        PlanFileError, SettingsError: See `RiskAssessor`; also if there are no samples.
     """
     stated = model_for(model or load_errors(), plan, lung)
     assessor = RiskAssessor(plan, lung, radius_mm=radius_mm)

@@ -276,7 +276,7 @@ class Draws:
 
     Each kind of error has two streams of its own, one number for each patient and one for each attempt, so
     that neither the model nor what was asked before changes a number.  Errors of the needle that are drawn
-    for each patient are the same in all its arcs.
+    for each patient are the same in all its arcs.  SettingsError is raised if there are to be none.
 
     Args:
         count, n_arcs: N and A of `Deviations`.
@@ -289,9 +289,6 @@ class Draws:
             kinds of which it has not those of the first.
         lps_from_scope_tip ((4, 4) float64): The axes along which a bias of the scope's position is stated; by
             default those of LPS.
-
-    Raises:
-        SettingsError: If there are to be none.
     """
 
     def __init__(

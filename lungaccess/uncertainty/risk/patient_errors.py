@@ -182,10 +182,8 @@ def model_for(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorM
     Errors about the resting shaft are stated about the plan.
 
     A model of free breathing keeps any phase of the breath, one without breathing is taken to insert in the
-    plan's window, each with the patient's motion and the spread of amplitudes over breaths.
-
-    Raises:
-        SettingsError: If the errors depend on the lobe and the patient came without lobes.
+    plan's window, each with the patient's motion and the spread of amplitudes over breaths.  SettingsError is
+    raised if the errors depend on the lobe and the patient came without lobes.
     """
     model = _with_border(about_resting_tip(_at_place(model, plan, lung), plan, lung), lung)
     motion, window, stated = lung.motion, plan.window, model.breathing

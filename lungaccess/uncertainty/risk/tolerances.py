@@ -72,14 +72,12 @@ def find_tolerances(
     """Return the tolerance of a plan to each kind of error alone.
 
     The largest size is found by bisection over a scale, every size with the same draws.  Breathing is left
-    out: it is an error of the target in one direction.
+    out: it is an error of the target in one direction.  PlanFileError and SettingsError are raised as by
+    `RiskAssessor`, also if the probability is not between 0 and 1.
 
     Args:
         probability: Probability of success that is asked for, above 0 and below 1.
         samples, seed: Draws for each size.
-
-    Raises:
-        PlanFileError, SettingsError: See `RiskAssessor`; also if the probability is not between 0 and 1.
     """
     if not 0.0 < probability < 1.0:
         raise SettingsError(

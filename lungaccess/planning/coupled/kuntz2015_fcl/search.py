@@ -60,7 +60,8 @@ class ReferenceSearch(ParallelSearch):
 
     The algorithm is as printed, but for what the paper leaves open or safety asks for.  The scope takes poses
     where it fits and an airway in lung tissue lies ahead, as in `KuntzSearch`; after line 8 the tubes are
-    validated too.  A path that is found is yielded only if the planner's proof accepts it.
+    validated too.  A path that is found is yielded only if the planner's proof accepts it.  SettingsError is
+    raised if an RRT has no budget.
 
     Args:
         rrt_iterations: Samples of each RRT: the same seed then gives the same plans.
@@ -71,9 +72,6 @@ class ReferenceSearch(ParallelSearch):
         counts: What became of the placements: `FOUND`, or why none was.
         spent_s: Processor time by part: "placement", "tubes", "needle", "proof".
         refused_by_proof: Paths that were found and are not yielded.
-
-    Raises:
-        SettingsError: If an RRT has no budget.
     """
 
     def __init__(

@@ -41,9 +41,8 @@ DOUBLINGS = 3
 class NamedNeedlePlanner:
     """Searches the needle's paths of one task with the planner that the task names.
 
-    Raises:
-        SettingsError: If it is a planner of OMPL and OMPL has been used in this process: it can be seeded
-            once.
+    SettingsError is raised if it is a planner of OMPL and OMPL has been used in this process: it can be
+    seeded once.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, default: str) -> None:

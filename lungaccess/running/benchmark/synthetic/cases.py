@@ -76,11 +76,7 @@ def benchmark_phantoms() -> tuple[BenchmarkPhantom, ...]:
 
 
 def phantom_named(name: str) -> BenchmarkPhantom:
-    """Return the phantom of that name.
-
-    Raises:
-        SettingsError: If there is none.
-    """
+    """Return the phantom of that name; SettingsError if there is none."""
     for each in benchmark_phantoms():
         if each.name == name:
             return each
@@ -183,9 +179,8 @@ def unproved_phantom(case: BenchmarkPhantom) -> Phantom:
 def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
     """Make a phantom of the benchmark.
 
-    Raises:
-        AnatomyError: If its masks are not those of the manifest: the generator, or a library below it, has
-            changed.
+    AnatomyError is raised if its masks are not those of the manifest: the generator, or a library below it,
+    has changed.
     """
     made = unproved_phantom(case)
     wanted, found = entries()[case.name].masks_sha256, masks_sha256(made.images)
@@ -294,8 +289,7 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
 def require_cases(folder: Path) -> tuple[BenchmarkPhantom, ...]:
     """Return the phantoms that a folder holds.
 
-    Raises:
-        FileError: If it is no folder of this benchmark, or of one with other phantoms.
+    FileError is raised if it is no folder of this benchmark, or of one with other phantoms.
     """
     remedy = f"Make it with: lungaccess benchmark {VERSION} make --out {folder}"
     content = read_json(folder / BENCHMARK, expected="what `make` wrote", remedy=remedy)

@@ -208,8 +208,7 @@ class _Scorer:
 def _own_masks(name: str, folder: Path, cache: Path | None) -> Lung:
     """Return the lung of a phantom, whose masks are those of the manifest.
 
-    Raises:
-        AnatomyError: If they are not: answers about other masks count for nothing.
+    AnatomyError is raised if they are not: answers about other masks count for nothing.
     """
     from anatomy.io.patients import load_patient as read_images
     from lungaccess.running.benchmark.synthetic.cases import masks_sha256
@@ -357,8 +356,7 @@ def write_sheet(lines: Iterable[SheetLine], path: Path) -> None:
 def write_scores(scores: Iterable[Score], path: Path) -> None:
     """Write scores by the suffix of the file, .csv or .json; what is not known stays empty, or null.
 
-    Raises:
-        FileError: If the file cannot be written, or ends in something else.
+    FileError is raised if the file cannot be written, or ends in something else.
     """
     _write_rows("scores", Score, [asdict(each) for each in scores], path)
 
@@ -378,8 +376,7 @@ def _write_rows(name: str, cls: type, rows: list[dict[str, Any]], path: Path) ->
 def read_scores(path: Path) -> list[Score]:
     """Read scores that `write_scores` wrote as JSON.
 
-    Raises:
-        FileError: If the file cannot be read, holds something else, or is of another benchmark.
+    FileError is raised if the file cannot be read, holds something else, or is of another benchmark.
     """
     expected, remedy = (
         "scores in JSON",

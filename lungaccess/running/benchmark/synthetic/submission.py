@@ -198,11 +198,7 @@ def submission_schema() -> dict[str, Any]:
 
 
 def write_submission(submission: Submission, path: Path) -> None:
-    """Write a submission, all or nothing.
-
-    Raises:
-        FileError: If the file cannot be written.
-    """
+    """Write a submission, all or nothing; FileError if the file cannot be written."""
     write_text(path, json.dumps(to_mapping(submission), allow_nan=False) + "\n")
 
 
@@ -311,8 +307,7 @@ WHERE NOT o.failed ORDER BY r.id"""
 def method_choice(words: str, iterations: int | None) -> PlannerChoice:
     """Return the planner of a study that words name: METHOD, or METHOD+NEEDLE_PLANNER.
 
-    Raises:
-        SettingsError: If there is no such method or planner of the needle.
+    SettingsError is raised if there is no such method or planner of the needle.
     """
     method, _joint, needle = words.partition(JOINT)
     return PlannerChoice(

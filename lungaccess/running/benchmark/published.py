@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -223,18 +223,23 @@ def _best(kinds: Mapping[str, list[dict[str, Any]]]) -> PeerResult:
         runs = [run for run in kinds[name] if run["valid_problem"]]
         solved = [run for run in runs if run["solved"]]
         firsts = [1e3 * run["first_cpu_s"] for run in solved if run["first_cpu_s"] is not None]
-        lengths = [run["length_end_mm"] + (run["goal_error_mm"] or 0.0) for run in solved]
         return PeerResult(
             planner=name,
             runs=len(runs),
             solved=len(solved),
-            first_cpu_ms=median(firsts) if firsts else None,
-            length_mm=median(lengths) if lengths else None,
+            first_cpu_ms=known_median(firsts),
+            length_mm=known_median(r["length_end_mm"] + (r["goal_error_mm"] or 0.0) for r in solved),
             refused=not runs,
         )
 
     results = [of(name) for name in kinds]
     return max(results, key=lambda r: (r.solved / max(r.runs, 1), -(r.first_cpu_ms or math.inf)))
+
+
+def known_median(values: Iterable[float | None]) -> float | None:
+    """Return the median of the values that are known; None without one."""
+    known = [each for each in values if each is not None]
+    return median(known) if known else None
 
 
 def patient_number(name: str) -> int:

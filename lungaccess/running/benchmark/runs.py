@@ -3,10 +3,10 @@
 import csv
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from lungaccess.running.benchmark.published import (
     Key,
     PeerResult,
     PublishedQuery,
+    known_median,
     patient_number,
     unc_needle,
     unc_obstacles,
@@ -183,16 +184,22 @@ def write_rows(rows: Iterable[BenchmarkRow], path: Path) -> None:
 
     FileError is raised if the file cannot be written, or ends in something else.
     """
+    columns = [field.name for field in fields(BenchmarkRow) if field.name != "arcs"]
+    write_table(path, columns, {"runs": [asdict(row) for row in rows]}, indent=2, end="\r\n")
+
+
+def write_table(
+    path: Path, columns: Sequence[str], content: Mapping[str, Any], *, indent: int | None, end: str
+) -> None:
+    """Write a content as JSON, or of the records in its last entry some columns as CSV; see `write_rows`."""
     require_table_file(path)
-    records = [asdict(row) for row in rows]
     with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
         if path.suffix == ".json":
-            stream.write(json.dumps({"runs": records}, indent=2, allow_nan=False) + "\n")
+            stream.write(json.dumps(content, indent=indent, allow_nan=False) + "\n")
             return
-        columns = [field.name for field in fields(BenchmarkRow) if field.name != "arcs"]
-        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
+        writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator=end)
         writer.writeheader()
-        writer.writerows(records)
+        writer.writerows([*content.values()][-1])
 
 
 HEADINGS = (
@@ -225,9 +232,10 @@ def _summary(group: list[BenchmarkRow], peer: Mapping[Key, PeerResult] | None) -
         decimals(row.radius_mm, 0),
         row.planner or ("all" if row.start else ""),
         f"{len(solved)}/{len(group)}" if row.planner else ("no" if row.start else ""),
-        _median([each.first_cpu_ms for each in solved], 2),
-        _median([each.first_length_mm for each in solved], 2),
-        _median([each.length_mm for each in solved], 2),
+        *(
+            decimals(known_median(getattr(each, name) for each in solved), 2)
+            for name in ("first_cpu_ms", "first_length_mm", "length_mm")
+        ),
         decimals(min((c for c in (each.clearance_mm for each in solved) if c is not None), default=None), 2),
     ]
     if peer is not None:
@@ -249,11 +257,6 @@ def _peer_cells(row: BenchmarkRow, peer: Mapping[Key, PeerResult]) -> list[str]:
         decimals(found.first_cpu_ms, 2),
         decimals(found.length_mm, 2),
     ]
-
-
-def _median(values: Iterable[float | None], digits: int) -> str:
-    known = [value for value in values if value is not None]
-    return decimals(median(known), digits) if known else ""
 
 
 def decimals(value: float | None, digits: int) -> str:

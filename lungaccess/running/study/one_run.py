@@ -35,21 +35,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
 from lungaccess.problem.system import System
 from lungaccess.problem.target import point_target
-from lungaccess.running.study.runs import (
-    EXACT,
-    INVALID_GOAL,
-    NO_PLAN,
-    PATH,
-    PLAN,
-    TIMEOUT,
-    UNKNOWN,
-    Answer,
-    Improvement,
-    Patient,
-    Problem,
-    Run,
-    open_patient,
-)
+from lungaccess.running.study import runs
 from lungaccess.running.study.settings import StudyError
 from stages.needle import OMPL_TOLERANCE_MM, Query, violation
 
@@ -70,7 +56,7 @@ class Opened(NamedTuple):
     checker: Checker
 
 
-def answer(run: Run, cache: Path | None = None) -> Answer:
+def answer(run: runs.Run, cache: Path | None = None) -> runs.Answer:
     """Make a run and return what it ended with.
 
     FileError is raised if a file cannot be read or written here; whatever else is not the run's own answer is
@@ -81,7 +67,7 @@ def answer(run: Run, cache: Path | None = None) -> Answer:
     return _here(run, cache)
 
 
-def prepare(problem: Problem, cache: Path | None = None) -> None:
+def prepare(problem: runs.Problem, cache: Path | None = None) -> None:
     """Make sure that the cache has the patient and the atlas of a problem, unless its device allows none.
 
     LungaccessError is raised if the patient cannot be read or the cache cannot be written.
@@ -93,13 +79,13 @@ def prepare(problem: Problem, cache: Path | None = None) -> None:
             _atlas_of(problem, cache)
 
 
-def _here(run: Run, cache: Path | None) -> Answer:
+def _here(run: runs.Run, cache: Path | None) -> runs.Answer:
     with _one_at_a_time:
         numba.set_num_threads(1)
         return _answered(run, _opened(run.problem.patient, cache), cache)
 
 
-def _answered(run: Run, opened: Opened, cache: Path | None) -> Answer:
+def _answered(run: runs.Run, opened: Opened, cache: Path | None) -> runs.Answer:
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
         atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
@@ -107,17 +93,17 @@ def _answered(run: Run, opened: Opened, cache: Path | None) -> Answer:
         began, cpu_began = time.perf_counter(), time.process_time()
         made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
     except NoPlan as failure:
-        made = Answer(
+        made = runs.Answer(
             key=run.key,
-            outcome=NO_PLAN,
-            status=TIMEOUT,
+            outcome=runs.NO_PLAN,
+            status=runs.TIMEOUT,
             message=failure.found,
             advice=failure.advice,
             rejections=dict(failure.reasons),
         )
     except ANSWERS as error:
-        status = INVALID_GOAL if isinstance(error, TargetError) else UNKNOWN
-        made = Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
+        status = runs.INVALID_GOAL if isinstance(error, TargetError) else runs.UNKNOWN
+        made = runs.Answer(key=run.key, outcome=type(error).__name__, status=status, message=str(error))
     return replace(
         made,
         time_s=time.perf_counter() - began,
@@ -126,10 +112,10 @@ def _answered(run: Run, opened: Opened, cache: Path | None) -> Answer:
     )
 
 
-def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
+def _plan_answer(run: runs.Run, opened: Opened, atlas: Atlas) -> runs.Answer:
     """Search for plans and let the best be checked."""
     problem, best = run.problem, None
-    improvements: list[Improvement] = []
+    improvements: list[runs.Improvement] = []
     target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
     began, first_s = time.process_time(), 0.0
     planner = run.planner
@@ -144,7 +130,7 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
         # The last plan has the cost of the best, and a simpler motion of the scope.
         if np.isfinite(loss) and (not improvements or loss < improvements[-1].cost):
             improvements.append(
-                Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
+                runs.Improvement(time_s=best.timing["planning_s"], iteration=best.iterations, cost=loss)
             )
         first_s = first_s or time.process_time() - began
         if problem.first_plan:
@@ -154,10 +140,10 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
     best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
     report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
-    return Answer(
+    return runs.Answer(
         key=run.key,
-        outcome=PLAN,
-        status=EXACT,
+        outcome=runs.PLAN,
+        status=runs.EXACT,
         iterations=best.iterations,
         accepted=report.accepted,
         costs=dict(best.costs),
@@ -168,7 +154,7 @@ def _plan_answer(run: Run, opened: Opened, atlas: Atlas) -> Answer:
     )
 
 
-def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
+def _chance(run: runs.Run, found: Plan, lung: Lung) -> Chance | None:
     """Return the chance of success of a plan on draws that no search saw, the same for all planners."""
     errors, procedure = run.problem.errors, run.problem.procedure
     if errors is None:
@@ -183,24 +169,24 @@ def _chance(run: Run, found: Plan, lung: Lung) -> Chance | None:
 
 
 @lru_cache(maxsize=KEPT_PATIENTS)
-def _opened(patient: Patient, cache: Path | None) -> Opened:
-    lung = open_patient(patient, cache)
+def _opened(patient: runs.Patient, cache: Path | None) -> Opened:
+    lung = runs.open_patient(patient, cache)
     return Opened(lung, Checker(lung))
 
 
-def _atlas_of(problem: Problem, cache: Path | None) -> Atlas:
+def _atlas_of(problem: runs.Problem, cache: Path | None) -> Atlas:
     spacing = (problem.rotations, problem.stop_spacing_mm, problem.site_spacing_mm)
     return _atlas(problem.patient, problem.system, cache, *spacing)
 
 
 @lru_cache(maxsize=KEPT_PATIENTS)
-def _atlas(patient: Patient, system: System, cache: Path | None, *spacing: Any) -> Atlas:
+def _atlas(patient: runs.Patient, system: System, cache: Path | None, *spacing: Any) -> Atlas:
     names = ("rotations", "stop_spacing_mm", "site_spacing_mm")
     lung = _opened(patient, cache).lung
     return open_atlas(lung, system, cache=cache, **dict(zip(names, spacing, strict=True)))
 
 
-def _in_own_process(run: Run, cache: Path | None) -> Answer:
+def _in_own_process(run: runs.Run, cache: Path | None) -> runs.Answer:
     """Make a run in a fresh process, as a library with one seed a process needs."""
     words = [sys.executable, "-m", "lungaccess.running.study.one_run", *([str(cache)] if cache else [])]
     done = subprocess.run(words, input=pickle.dumps(run), capture_output=True)
@@ -211,7 +197,7 @@ def _in_own_process(run: Run, cache: Path | None) -> Answer:
             expected="a process that ends with 0",
             remedy="Start the study again; it goes on from what is stored",
         )
-    made: Answer = pickle.loads(done.stdout)
+    made: runs.Answer = pickle.loads(done.stdout)
     return made
 
 
@@ -227,7 +213,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def needle_answer(run: Run, lung: Lung) -> Answer:
+def needle_answer(run: runs.Run, lung: Lung) -> runs.Answer:
     """Search for a needle path and let `stages.needle.path.violation` look at it.
 
     Raises:
@@ -255,7 +241,7 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
         time_s=problem.time_s,
     )
     if found.path is None:
-        return Answer(key=run.key, outcome=NO_PLAN, status=TIMEOUT, message=found.outcome)
+        return runs.Answer(key=run.key, outcome=runs.NO_PLAN, status=runs.TIMEOUT, message=found.outcome)
     record = found.record()
     first_s = record["path"].pop("first_path_s")
     costs = record["path"]["costs"]
@@ -263,14 +249,14 @@ def needle_answer(run: Run, lung: Lung) -> Answer:
     query = Query(lps_from_start=pose, target=target.lps_mm, branch=found.branch)
     tolerance_mm = OMPL_TOLERANCE_MM if run.planner.is_of_ompl else found.environment.goal_tolerance_mm
     why = violation(found.environment, query, found.path, goal_tolerance_mm=tolerance_mm)
-    return Answer(
+    return runs.Answer(
         key=run.key,
-        outcome=PATH,
-        status=EXACT,
+        outcome=runs.PATH,
+        status=runs.EXACT,
         message=why,
         accepted=not why,
         costs=costs,
-        improvements=(Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
+        improvements=(runs.Improvement(time_s=first_s, iteration=0, cost=costs[problem.objective]),),
         plan=text,
         digest=hashlib.sha256(text.encode()).hexdigest(),
     )

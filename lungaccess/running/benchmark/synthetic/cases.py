@@ -8,11 +8,8 @@ FOLDER/adult-01/case.json          its queries: name, device, target
 FOLDER/adult-01/tips-NAME.json     for each device, where a scope can stand, with the motion that leads there
 ```
 
-`benchmark.json` is written last, so that a folder that has it is complete.
-
-Scope tips of a case: where a scope can stand, with the motion that leads there.
-
-They let a planner start from a bronchoscope without having one of its own.  A submission names one by number.
+`benchmark.json` is written last, so that a folder that has it is complete.  The tips let a planner start from
+a bronchoscope without having one of its own: a submission names one by number.
 """
 
 import hashlib
@@ -183,14 +180,17 @@ def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
     has changed.
     """
     made = unproved_phantom(case)
-    wanted, found = entries()[case.name].masks_sha256, masks_sha256(made.images)
-    if found != wanted:
-        raise AnatomyError(
-            f"The masks of {case.name} made here have the hash {found[:16]}",
-            expected=f"{wanted[:16]}, as the manifest of {VERSION} says",
-            remedy="Install the versions that constraints.txt names; a changed generator needs a new version",
-        )
+    remedy = "Install the versions that constraints.txt names; a changed generator needs a new version"
+    require_masks(case.name, made.images, f"of {case.name} made here", remedy)
     return made
+
+
+def require_masks(name: str, images: PatientImages, which: str, remedy: str) -> None:
+    """Raise AnatomyError unless the masks of a phantom, which the words tell, are those of the manifest."""
+    wanted, found = entries()[name].masks_sha256, masks_sha256(images)
+    if found != wanted:
+        expected = f"{wanted[:16]}, as the manifest of {VERSION} says"
+        raise AnatomyError(f"The masks {which} have the hash {found[:16]}", expected=expected, remedy=remedy)
 
 
 BENCHMARK, CASE = "benchmark.json", "case.json"

@@ -1,35 +1,24 @@
 """Scores of a submission: every answer is checked anew, by the independent check and nothing else."""
 
-import csv
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, fields
 from itertools import groupby
 from pathlib import Path
-from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from anatomy.base.errors import AnatomyError, FileError, PlanFileError
-from anatomy.base.files import atomic_write, read_json
+from anatomy.base.errors import FileError, PlanFileError
+from anatomy.base.files import read_json
 from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
 from lungaccess.problem.patients import load_patient
 from lungaccess.problem.system import load_system
-from lungaccess.running.benchmark.runs import decimals, require_table_file
-from lungaccess.running.benchmark.synthetic.cases import (
-    VERSION,
-    BenchmarkQuery,
-    PublishedTips,
-    all_queries,
-    entries,
-    manifest_sha256,
-    phantom_named,
-    require_cases,
-)
+from lungaccess.running.benchmark.published import known_median
+from lungaccess.running.benchmark.runs import decimals, write_table
+from lungaccess.running.benchmark.synthetic import cases
 from lungaccess.running.benchmark.synthetic.submission import (
     Submission,
     SubmittedAnswer,
@@ -105,15 +94,15 @@ def score_submission(
         AnatomyError: If the masks of a phantom in the folder are not those of the manifest.
         SettingsError: If an answer names a tip that was not published.
     """
-    phantoms = require_cases(folder)
+    phantoms = cases.require_cases(folder)
     require_queries(submission.answers, (each.name for each in phantoms), folder)
     answers = {each.query: each for each in submission.answers}
     held = {each.name for each in phantoms}
     asked = [
-        query for query in all_queries().values()
+        query for query in cases.all_queries().values()
         if query.phantom in held and (query.name in answers or not only_answered)
     ]  # fmt: skip
-    tips = PublishedTips(folder)
+    tips = cases.PublishedTips(folder)
     done = 0
     for name, of_phantom in groupby(asked, key=lambda query: query.phantom):
         queries = list(of_phantom)
@@ -131,11 +120,11 @@ def score_submission(
                 yield _named(query, submission.planner, status, cpu_s=cpu_s)
 
 
-def _named(query: BenchmarkQuery, planner: str, status: str, **more: Any) -> Score:
+def _named(query: cases.BenchmarkQuery, planner: str, status: str, **more: Any) -> Score:
     return Score(
         query=query.name,
         phantom=query.phantom,
-        family=phantom_named(query.phantom).family,
+        family=cases.phantom_named(query.phantom).family,
         system=query.system,
         target=query.target,
         planner=planner,
@@ -147,12 +136,12 @@ def _named(query: BenchmarkQuery, planner: str, status: str, **more: Any) -> Sco
 class _Scorer:
     """Scores the answers about one phantom."""
 
-    def __init__(self, lung: Lung, tips: PublishedTips, samples: int, certify_boxes: int) -> None:
+    def __init__(self, lung: Lung, tips: cases.PublishedTips, samples: int, certify_boxes: int) -> None:
         self._lung, self._checker = lung, Checker(lung)
         self._tips, self._samples, self._certify_boxes = tips, samples, certify_boxes
         self._proofs: dict[str, UnreachableProof] = {}
 
-    def score(self, query: BenchmarkQuery, answer: SubmittedAnswer, planner: str) -> Score:
+    def score(self, query: cases.BenchmarkQuery, answer: SubmittedAnswer, planner: str) -> Score:
         """Return what an answer comes to."""
         if not answer.planned:
             proved = self._is_proved(query)
@@ -193,7 +182,7 @@ class _Scorer:
             not_checked=", ".join(each.name for each in report.unchecked),
         )
 
-    def _is_proved(self, query: BenchmarkQuery) -> bool:
+    def _is_proved(self, query: cases.BenchmarkQuery) -> bool:
         from lungaccess.planning.reachability import UnreachableProof
 
         if query.system not in self._proofs:
@@ -211,15 +200,9 @@ def _own_masks(name: str, folder: Path, cache: Path | None) -> Lung:
     AnatomyError is raised if they are not: answers about other masks count for nothing.
     """
     from anatomy.io.patients import load_patient as read_images
-    from lungaccess.running.benchmark.synthetic.cases import masks_sha256
 
-    wanted, found = entries()[name].masks_sha256, masks_sha256(read_images(folder))
-    if found != wanted:
-        raise AnatomyError(
-            f"The masks in {folder} have the hash {found[:16]}",
-            expected=f"{wanted[:16]}, as the manifest says",
-            remedy="Delete the folder of this phantom and make it again",
-        )
+    remedy = "Delete the folder of this phantom and make it again"
+    cases.require_masks(name, read_images(folder), f"in {folder}", remedy)
     return load_patient(folder, cache=cache)
 
 
@@ -324,33 +307,24 @@ def _line(
         refused=sum(each.status == REFUSED for each in scores),
         certified=sum(each.status == CERTIFIED for each in scores),
         refuted=sum(each.status == CLAIMED and each.query in wrong for each in scores),
-        first_cpu_s=_median([each.first_cpu_s for each in solved]),
-        cpu_s=_median([each.cpu_s for each in scores if each.status != MISSING]),
-        cost=_median([each.cost for each in solved]),
-        shared_cost=_median([each.cost for each in solved if each.query in shared]),
+        first_cpu_s=known_median(each.first_cpu_s for each in solved),
+        cpu_s=known_median(each.cpu_s for each in scores if each.status != MISSING),
+        cost=known_median(each.cost for each in solved),
+        shared_cost=known_median(each.cost for each in solved if each.query in shared),
         success=_mean([each.success for each in solved]),
         breath_share=_mean([each.breath_share for each in solved]),
         not_checked=sum(bool(each.not_checked) for each in solved),
     )
 
 
-def _known(values: Iterable[float | None]) -> list[float]:
-    return [each for each in values if each is not None]
-
-
-def _median(values: Iterable[float | None]) -> float | None:
-    known = _known(values)
-    return median(known) if known else None
-
-
 def _mean(values: Iterable[float | None]) -> float | None:
-    known = _known(values)
+    known = [each for each in values if each is not None]
     return sum(known) / len(known) if known else None
 
 
 def write_sheet(lines: Iterable[SheetLine], path: Path) -> None:
     """Write the lines of a sheet by the suffix of the file, .csv or .json; errors as of `write_scores`."""
-    _write_rows("sheet", SheetLine, [asdict(each) for each in lines], path)
+    _write_rows("sheet", SheetLine, lines, path)
 
 
 def write_scores(scores: Iterable[Score], path: Path) -> None:
@@ -358,19 +332,13 @@ def write_scores(scores: Iterable[Score], path: Path) -> None:
 
     FileError is raised if the file cannot be written, or ends in something else.
     """
-    _write_rows("scores", Score, [asdict(each) for each in scores], path)
+    _write_rows("scores", Score, scores, path)
 
 
-def _write_rows(name: str, cls: type, rows: list[dict[str, Any]], path: Path) -> None:
-    require_table_file(path)
-    with atomic_write(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
-        if path.suffix == ".json":
-            about: dict[str, Any] = {"benchmark": VERSION, "manifest_sha256": manifest_sha256()}
-            stream.write(json.dumps({**about, name: rows}, allow_nan=False) + "\n")
-            return
-        writer = csv.DictWriter(stream, [item.name for item in fields(cls)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def _write_rows(name: str, cls: type, rows: Iterable[Any], path: Path) -> None:
+    about: dict[str, Any] = {"benchmark": cases.VERSION, "manifest_sha256": cases.manifest_sha256()}
+    columns = [item.name for item in fields(cls)]
+    write_table(path, columns, {**about, name: [asdict(each) for each in rows]}, indent=None, end="\n")
 
 
 def read_scores(path: Path) -> list[Score]:
@@ -380,11 +348,11 @@ def read_scores(path: Path) -> list[Score]:
     """
     expected, remedy = (
         "scores in JSON",
-        f"Write them with: lungaccess benchmark {VERSION} score ... --out scores.json",
+        f"Write them with: lungaccess benchmark {cases.VERSION} score ... --out scores.json",
     )
     content = read_json(path, expected=expected, remedy=remedy)
-    if not isinstance(content, dict) or content.get("manifest_sha256") != manifest_sha256():
-        raise FileError(f"{path} holds no scores of {VERSION}", expected=expected, remedy=remedy)
+    if not isinstance(content, dict) or content.get("manifest_sha256") != cases.manifest_sha256():
+        raise FileError(f"{path} holds no scores of {cases.VERSION}", expected=expected, remedy=remedy)
     try:
         return [Score(**row) for row in content["scores"]]
     except (KeyError, TypeError) as error:

@@ -19,18 +19,7 @@ from lungaccess.judging.checking.completion import Motions
 from lungaccess.plans.parts import DeployedShape, NeedleArc
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import load_system
-from lungaccess.running.benchmark.synthetic.cases import (
-    SYSTEMS,
-    TARGETS_A_LUNG,
-    VERSION,
-    BenchmarkPhantom,
-    BenchmarkQuery,
-    PublishedTips,
-    all_queries,
-    entries,
-    phantom_named,
-    require_cases,
-)
+from lungaccess.running.benchmark.synthetic import cases
 from lungaccess.running.study.one_run import FIRST_CPU, SEARCH_CPU
 from lungaccess.running.study.results import ResultsFile
 from lungaccess.running.study.settings import AtlasGrid, Budget, Case, PlannerChoice, Study
@@ -137,7 +126,7 @@ class Submission:
     """The answers of one planner; a query without an answer counts as not solved."""
 
     schema: Annotated[str, text("format of the file")] = SCHEMA
-    benchmark: Annotated[str, text("name of the benchmark")] = VERSION
+    benchmark: Annotated[str, text("name of the benchmark")] = cases.VERSION
     planner: Annotated[str, text("name of the planner in tables")]
     machine: Annotated[str, text("processor that the times are of", may_be_empty=True)] = ""
     answers: tuple[SubmittedAnswer, ...] = ()
@@ -145,8 +134,8 @@ class Submission:
     def __post_init__(self) -> None:
         if self.schema != SCHEMA:
             raise impossible("schema", self.schema, SCHEMA)
-        if self.benchmark != VERSION:
-            raise impossible("benchmark", self.benchmark, VERSION)
+        if self.benchmark != cases.VERSION:
+            raise impossible("benchmark", self.benchmark, cases.VERSION)
 
 
 def read_submission(path: Path) -> Submission:
@@ -169,7 +158,7 @@ def submission_of(content: object, where: str = "submission") -> Submission:
         parse(SubmittedAnswer, _mapping(each, f"{where}, answer {n}"), f"{where}, answer {n}", REMEDY)
         for n, each in enumerate(content["answers"], start=1)
     )
-    known, seen = all_queries(), set[str]()
+    known, seen = cases.all_queries(), set[str]()
     for n, each in enumerate(answers, start=1):
         if each.query not in known:
             raise SettingsError(
@@ -211,11 +200,13 @@ def require_queries(answers: Iterable[SubmittedAnswer], phantoms: Iterable[str],
             raise FileError(
                 f"{folder} does not hold {phantom}, which {answer.query} is about",
                 expected="the phantoms of all answers",
-                remedy=f"lungaccess benchmark {VERSION} make --out {folder} --phantoms {phantom}",
+                remedy=f"lungaccess benchmark {cases.VERSION} make --out {folder} --phantoms {phantom}",
             )
 
 
-def answer_of_plan(query: BenchmarkQuery, plan: Plan, *, first_cpu_s: float, cpu_s: float) -> SubmittedAnswer:
+def answer_of_plan(
+    query: cases.BenchmarkQuery, plan: Plan, *, first_cpu_s: float, cpu_s: float
+) -> SubmittedAnswer:
     """Return the answer that a plan of our own makes: its motions, nothing of what it states beside them."""
     needle = plan.needle
     if needle is None:
@@ -243,7 +234,9 @@ def _pose(matrix: Float) -> Any:
     return tuple(tuple(float(x) for x in row) for row in matrix)
 
 
-def motions_of_answer(query: BenchmarkQuery, answer: SubmittedAnswer, tips: PublishedTips) -> Motions:
+def motions_of_answer(
+    query: cases.BenchmarkQuery, answer: SubmittedAnswer, tips: cases.PublishedTips
+) -> Motions:
     """Return what the devices of an answer do.
 
     Raises:
@@ -320,7 +313,7 @@ def benchmark_study(
     methods: Sequence[str] = ("atlas",),
     *,
     phantoms: Iterable[str] = (),
-    systems: Sequence[str] = SYSTEMS,
+    systems: Sequence[str] = cases.SYSTEMS,
     targets: int | None = None,
     iterations: int | None = ITERATIONS,
     time_s: float | None = None,
@@ -335,20 +328,22 @@ def benchmark_study(
         FileError: If the folder is not one of this benchmark.
         SettingsError: If it does not hold a phantom, or there is no such device or method.
     """
-    held = require_cases(folder)
-    chosen = tuple(phantom_named(name) for name in phantoms) or held
+    held = cases.require_cases(folder)
+    chosen = tuple(cases.phantom_named(name) for name in phantoms) or held
     for case in chosen:
         if case not in held:
             raise SettingsError(
                 f"{folder} does not hold {case.name}",
                 expected=", ".join(each.name for each in held),
-                remedy=f"lungaccess benchmark {VERSION} make --out {folder} --phantoms {case.name}",
+                remedy=f"lungaccess benchmark {cases.VERSION} make --out {folder} --phantoms {case.name}",
             )
     for system in systems:
-        if system not in SYSTEMS:
-            raise SettingsError(f"{VERSION} has no device {system!r}", expected=", ".join(SYSTEMS))
+        if system not in cases.SYSTEMS:
+            raise SettingsError(
+                f"{cases.VERSION} has no device {system!r}", expected=", ".join(cases.SYSTEMS)
+            )
     return Study(
-        name=VERSION,
+        name=cases.VERSION,
         case=tuple(_case(folder, case, system, targets) for case in chosen for system in systems),
         planner=tuple(method_choice(words, iterations) for words in methods),
         budget=Budget(iterations=iterations, time_s=time_s),
@@ -357,10 +352,10 @@ def benchmark_study(
     )
 
 
-def _case(folder: Path, case: BenchmarkPhantom, system: str, targets: int | None) -> Case:
-    points = entries()[case.name].targets_lps
+def _case(folder: Path, case: cases.BenchmarkPhantom, system: str, targets: int | None) -> Case:
+    points = cases.entries()[case.name].targets_lps
     # In turns, so that runs of the first targets remain those of a study of more.
-    pairs = tuple(zip(points[:TARGETS_A_LUNG], points[TARGETS_A_LUNG:], strict=True))[:targets]
+    pairs = tuple(zip(points[: cases.TARGETS_A_LUNG], points[cases.TARGETS_A_LUNG :], strict=True))[:targets]
     chosen = [point for pair in pairs for point in pair]
     return Case(
         name=f"{case.name}/{system}",
@@ -381,7 +376,9 @@ def submissions_of(path: Path) -> list[Submission]:
         FileError: If the results cannot be read.
         SettingsError: If they are not of this benchmark.
     """
-    queries = {(f"{each.phantom}/{each.system}", each.target_lps): each for each in all_queries().values()}
+    queries = {
+        (f"{each.phantom}/{each.system}", each.target_lps): each for each in cases.all_queries().values()
+    }
     answers: dict[str, dict[str, SubmittedAnswer]] = {}
     with ResultsFile(path) as results:
         for case, x, y, z, planner, cpu_s, text in results.rows(_QUERY):
@@ -389,8 +386,8 @@ def submissions_of(path: Path) -> list[Submission]:
             if query is None:
                 raise SettingsError(
                     f"{path} has a run of {case} to lps:{x},{y},{z}",
-                    expected=f"runs of {VERSION} alone",
-                    remedy=f"Make them with: lungaccess benchmark {VERSION} run",
+                    expected=f"runs of {cases.VERSION} alone",
+                    remedy=f"Make them with: lungaccess benchmark {cases.VERSION} run",
                 )
             answer = SubmittedAnswer(query=query.name, cpu_s=cpu_s)
             if text:

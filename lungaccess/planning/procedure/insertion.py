@@ -12,18 +12,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.settings import to_mapping
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from lungaccess.planning.procedure.truth import (
-    ARCS,
-    Attempt,
-    Steered,
-    as_pieces,
-    ends_of,
-    fitted_to,
-    insert_needle,
-    rows_of,
-    turned_about,
-    unknown_of,
-)
+from lungaccess.planning.procedure import truth
 from lungaccess.plans import curves
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.error_files import load_errors
@@ -216,7 +205,7 @@ class _Inserter:
             vessel_border=errors.vessel_border,
         )  # fmt: skip
         # The needle begins where the plan has it, which is known.
-        self._unknown = unknown_of(believed, steering, np.zeros((6, 6)))
+        self._unknown = truth.unknown_of(believed, steering, np.zeros((6, 6)))
         self._assessor = RiskAssessor(plan, lung, radius_mm=tolerance_mm)
         needle = plan.system.require_needle("A simulated insertion")
         self._environment: NeedleEnvironment = needle_environment(
@@ -231,27 +220,26 @@ class _Inserter:
     def open_and_closed_loop(self, samples: int, seed: int) -> tuple[Summary, Summary]:
         """Insert needles blindly, and the same ones with the tracker."""
         plan, n_arcs = self.plan, len(self.path.arcs)
-        errors = self._assessor.draws(samples, seed, n_arcs=ARCS).deviations(self.errors)
-        pieces = deviated_pieces(plan, fitted_to(n_arcs, errors))
+        errors = self._assessor.draws(samples, seed, n_arcs=truth.ARCS).deviations(self.errors)
+        pieces = deviated_pieces(plan, truth.fitted_to(n_arcs, errors))
         tubes, needles = pieces[:, :-n_arcs], pieces[:, -n_arcs:]
         # Tubes that are turned too far do not take the needle along, which is turned from outside.
         rolled = needles[:, 0, 1] - self.path.arcs[0, 1] - errors.roll_rad[:, 0]
-        ends = ends_of(np.tile(np.asarray(plan.scope.lps_from_scope_tip), (samples, 1, 1)), tubes)
-        tips = turned_about(ends, rolled)
+        ends = truth.ends_of(np.tile(np.asarray(plan.scope.lps_from_scope_tip), (samples, 1, 1)), tubes)
+        tips = truth.turned_about(ends, rolled)
         blind, watched = [], []
         for n in range(samples):
-            attempt = Attempt(
-                errors=rows_of(errors, np.array([n])), target_lps=self.query.target + errors.target_mm[n]
-            )
+            own = truth.rows_of(errors, np.array([n]))
+            attempt = truth.Attempt(errors=own, target_lps=self.query.target + errors.target_mm[n])
             blind.append(self._checked(attempt, tubes[n], needles[n], ends[n], None))
             found = self._watched(attempt, tips[n], (seed, n))
             arcs = np.array(found.arcs)
             arcs[:1, 1] += rolled[n]
-            (needle,) = as_pieces(arcs[None], plan.system.track_radius_mm)
+            (needle,) = truth.as_pieces(arcs[None], plan.system.track_radius_mm)
             watched.append(self._checked(attempt, tubes[n], needle, ends[n], found))
         return Summary.of(blind), Summary.of(watched)
 
-    def _watched(self, attempt: Attempt, tip: Float, luck: tuple[int, int]) -> Steered:
+    def _watched(self, attempt: truth.Attempt, tip: Float, luck: tuple[int, int]) -> truth.Steered:
         """Insert the needle with the tracker; `luck` is the seed and the number of the needle."""
         replanner = Replanner(
             self._environment, self.query, self.path, objective=Objective.of(self.plan.objective),
@@ -260,13 +248,13 @@ class _Inserter:
         )  # fmt: skip
         # Stream of the tracker's noise, beyond those of the kinds of error.
         rng = np.random.default_rng(np.random.SeedSequence(luck[0], spawn_key=(1000, luck[1])))
-        return insert_needle(
+        return truth.insert_needle(
             self._environment, self.query, self.path, replanner, attempt, tip, self.steering, self._unknown,
             rng,
         )  # fmt: skip
 
     def _checked(
-        self, attempt: Attempt, tubes: Float, needle: Float, end: Float, steered: Steered | None
+        self, attempt: truth.Attempt, tubes: Float, needle: Float, end: Float, steered: truth.Steered | None
     ) -> Insertion:
         """Return what true arcs have come to; `end` is the frame behind those of the tubes."""
         frame = np.asarray(self.plan.scope.lps_from_scope_tip)

@@ -18,6 +18,7 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.one_stage import replan_from_tube
+from lungaccess.planning.procedure import spread
 from lungaccess.planning.procedure.choices import (
     DRAWS,
     Action,
@@ -30,17 +31,6 @@ from lungaccess.planning.procedure.choices import (
     with_choices,
 )
 from lungaccess.planning.procedure.kernels import decisions as kernel
-from lungaccess.planning.procedure.spread import (
-    ASIDE,
-    around,
-    as_measured,
-    fused,
-    fused_share,
-    mean_pose,
-    scope_moves,
-    sizes_of,
-    tip_moves,
-)
 from lungaccess.plans.assemble import needle_part, tube_part
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.plans.no_plan import NoPlan
@@ -162,7 +152,8 @@ class Policy:
         margins = {each.name: share * getattr(whole.margins, each.name) for each in fields(whole.margins)}
         self.system = replace(whole, margins=replace(whole.margins, **margins))
         aside_mm = self.aside_mm if self.procedure.tubes.measured else 0.0
-        self._left = sizes_of(self.system, self.errors, self.procedure, self.assessor.stretch, aside_mm)
+        about = self.errors, self.procedure, self.assessor.stretch
+        self._left = spread.sizes_of(self.system, *about, aside_mm)
         arcs = [] if plan.needle is None else plan.needle.arcs
         self._planned = np.array([(a.length_mm, a.roll_rad, a.curvature_per_mm) for a in arcs]).reshape(-1, 3)
         path = ArcPath(lps_from_start=np.eye(4), arcs=self._planned)
@@ -171,7 +162,7 @@ class Policy:
     @property
     def aside_mm(self) -> float:
         """How far from the centre of the goal the needle may be aimed at where it cannot be reached."""
-        return ASIDE * self.assessor.radius_mm
+        return spread.ASIDE * self.assessor.radius_mm
 
     # Scope ----------------------------------------------------------------------------------------
 
@@ -185,7 +176,7 @@ class Policy:
         known = term("scope_position").rms, math.radians(term("scope_direction").rms)
         noise = placing.position_mm / math.sqrt(count), math.radians(placing.direction_deg) / math.sqrt(count)
         every = np.broadcast_to(expected, measured.shape)
-        likely = np.array(fused(every, scope_moves(every, *known), measured, *noise))
+        likely = np.array(spread.fused(every, spread.scope_moves(every, *known), measured, *noise))
         likely[:, :3, 3] = self._in_lumen(likely[:, :3, 3])
         drawn = np.zeros((len(likely), DRAWS, 3))
         shifts = self._planned_choice.errors[:, :3]
@@ -317,23 +308,23 @@ class Policy:
     def tips_measured(self, chosen: Chosen, measured: Float, count: int = 1) -> Float:
         """Return where tips of the tubes most likely are, `(N, 4, 4)`, see `scopes_measured`."""
         stage, root = self.procedure.tubes, math.sqrt(count)
-        moves = tip_moves(chosen.frames, chosen.tips, self._left)
+        moves = spread.tip_moves(chosen.frames, chosen.tips, self._left)
         noise = stage.position_mm / root, math.radians(stage.direction_deg) / root
-        return fused(chosen.tips, moves, measured, *noise)
+        return spread.fused(chosen.tips, moves, measured, *noise)
 
     def doubt_of(self, lps_from_scope_tip: Float, lps_from_tip: Float) -> Float:
         """Return the covariance `(6, 6)` of the pose in which a needle begins, mm and rotation vector."""
         stage = self.procedure.tubes
         if stage.measured:
             return np.diag(np.repeat((stage.position_mm, math.radians(stage.direction_deg)), 3) ** 2)
-        moves = tip_moves(lps_from_scope_tip, lps_from_tip, self._left)
+        moves = spread.tip_moves(lps_from_scope_tip, lps_from_tip, self._left)
         return np.asarray(moves @ moves.T)
 
     def targets_measured(self, measured: Float) -> Float:
         """Return where targets most likely are, `(N, 3)`, that an image before the needle shows."""
         errors, breath = self.errors.term("target_position").rms, self.errors.term(BREATHING).size
         expected = np.array([errors, errors, math.hypot(errors, self.assessor.stretch * breath)])
-        found = self._target + fused_share(expected, self.procedure.imaging.position_mm) * (
+        found = self._target + spread.fused_share(expected, self.procedure.imaging.position_mm) * (
             measured - self._target
         )
         # Where the masks say that a nodule cannot be, the measurement is not believed.
@@ -441,7 +432,7 @@ class Policy:
         left = max(procedure.scope.placements - measured.placements, 0)
         chosen = self.as_planned(1)
         if procedure.scope.measured:
-            placed = self.scopes_measured(mean_pose(poses.scope)[None], len(poses.scope))
+            placed = self.scopes_measured(spread.mean_pose(poses.scope)[None], len(poses.scope))
             chosen = self.from_scopes(placed)
         if not len(poses.tubes) and not len(poses.needle):
             return self._decision(chosen, left, tubes_out=False)
@@ -449,11 +440,11 @@ class Policy:
         if measured.target_lps is not None and procedure.imaging.measured:
             target = self.targets_measured((measured.target_lps + self._target - self.plan.target_lps)[None])
         if len(poses.tubes) and self.plan.needle is not None:
-            tips = self.tips_measured(chosen, mean_pose(poses.tubes)[None], len(poses.tubes))
+            tips = self.tips_measured(chosen, spread.mean_pose(poses.tubes)[None], len(poses.tubes))
             chosen = self.from_tubes(chosen, tips, target)
         if not len(poses.needle) or self.plan.needle is None:
             return self._decision(chosen, left, tubes_out=True)
-        return self._on_the_way(chosen, mean_pose(poses.needle), target[0])
+        return self._on_the_way(chosen, spread.mean_pose(poses.needle), target[0])
 
     def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> Decision:
         chance, changed = float(chosen.chances[0]), bool(chosen.changed[0])
@@ -507,8 +498,8 @@ class Policy:
         drawn = self.assessor.draws(IMAGINED, _SEED).deviations(self.errors)
         true = scope_frames(deviated_starts(self.plan, self.lung, drawn))
         noise = np.random.default_rng(_SEED).standard_normal((IMAGINED, 5))
-        placing = self.procedure.scope
-        return self.scopes_measured(as_measured(true, placing.position_mm, placing.direction_deg, noise))
+        size = self.procedure.scope.position_mm, self.procedure.scope.direction_deg
+        return self.scopes_measured(spread.as_measured(true, *size, noise))
 
     @cached_property
     def _offer(self) -> Offer:
@@ -544,7 +535,7 @@ class Policy:
         forbidden = sum(self.assessor.structures[name] for name in self.assessor.forbidden)
         tubes = self.procedure.tubes.measured
         return kernel.Scene(
-            around=around(lung, with_fissures=fissures), obstacles=obstacles, limits=limits,
+            around=spread.around(lung, with_fissures=fissures), obstacles=obstacles, limits=limits,
             judged=Obstacles(every.corners, lung.labels, every.geometry, obstacle_bits(lung.has_fissures)),
             forbidden=forbidden, depth=judged.depth, depth_geometry=judged.geometry,
             mediastinal=judged.mediastinal, radius=self.assessor.radius_mm,

@@ -11,23 +11,11 @@ from anatomy.base.child_process import can_fork, end_with_parent, forked, receiv
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.lung import Lung
+from lungaccess.planning.procedure import truth
 from lungaccess.planning.procedure.choices import scope_frames
 from lungaccess.planning.procedure.policy import LEAST_CHANCE, Chosen, OnTheWay, Policy, rest_of
 from lungaccess.planning.procedure.report import NO_PATH, ProcedureReport, StageReport
 from lungaccess.planning.procedure.spread import as_measured
-from lungaccess.planning.procedure.truth import (
-    ARCS,
-    Attempt,
-    as_pieces,
-    ends_of,
-    fitted_to,
-    insert_needle,
-    needles_carried_out,
-    rows_of,
-    tube_pieces,
-    turned_about,
-    unknown_of,
-)
 from lungaccess.plans.kernels.tissue import Wanted
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.errors import CURVATURE, ErrorModel
@@ -135,7 +123,7 @@ class _Run:
         self.samples, self._seed = samples, seed
         plan, procedure = policy.plan, policy.procedure
         count = procedure.scope.placements if procedure.scope.measured or procedure.tubes.measured else 1
-        n_arcs = ARCS if plan.needle is not None else 0
+        n_arcs = truth.ARCS if plan.needle is not None else 0
         self._attempts: list[Deviations] = [
             policy.assessor.draws(samples, seed, attempt=number, n_arcs=n_arcs)
             .of_pass(n_arcs, anew)
@@ -156,7 +144,7 @@ class _Run:
         """Return what comes of all procedures."""
         if self._policy.procedure.is_open_loop:
             # Carry out the plan as it stands, as `assess` does.
-            outcomes = self.assessor.outcomes(fitted_to(self.assessor.n_arcs, self._attempts[0]))
+            outcomes = self.assessor.outcomes(truth.fitted_to(self.assessor.n_arcs, self._attempts[0]))
             ones = np.ones(self.samples, dtype=np.int64)
             none = np.zeros(self.samples, dtype=bool)
             shifts = self._attempts[0].target_mm
@@ -190,7 +178,7 @@ class _Run:
     def _attempt(self, attempt: int, numbers: Int, active: Int, found: Found) -> Bool:
         """Place the scope once in the active procedures; tell which `(N,)` are over."""
         policy, procedure, rows = self._policy, self._policy.procedure, numbers[active]
-        errors, noise = rows_of(self._attempts[attempt], rows), self._noise[rows, attempt]
+        errors, noise = truth.rows_of(self._attempts[attempt], rows), self._noise[rows, attempt]
         starts, left = self._starts[attempt][rows], len(self._attempts) - 1 - attempt
         found.placements[active] += 1
         goes = np.arange(len(rows))
@@ -208,9 +196,8 @@ class _Run:
             chosen = chosen.only(goes)
         else:
             chosen = policy.as_planned(len(rows))
-        went = _Went(
-            chosen, rows_of(errors, goes), np.ascontiguousarray(starts[goes]), noise[goes, 1:], rows[goes]
-        )
+        own, begun = truth.rows_of(errors, goes), np.ascontiguousarray(starts[goes])
+        went = _Went(chosen, own, begun, noise[goes, 1:], rows[goes])
         complete = self._devices_out(went, left, active[goes], found)
         over = np.zeros(len(rows), dtype=bool)
         over[goes] = complete
@@ -220,11 +207,11 @@ class _Run:
         """Let tubes and needles out, and note what came of it; tell which needles were inserted."""
         policy, plan, procedure = self._policy, self._policy.plan, self._policy.procedure
         chosen, errors = went.chosen, went.errors
-        tubes, rolled = tube_pieces(plan, chosen, errors)
+        tubes, rolled = truth.tube_pieces(plan, chosen, errors)
         done = np.ones(len(at), dtype=bool)
         pieces, n_tube = tubes, tubes.shape[1]
         if plan.needle is not None:
-            true_tips = turned_about(ends_of(scope_frames(went.starts), tubes), -rolled)
+            true_tips = truth.turned_about(truth.ends_of(scope_frames(went.starts), tubes), -rolled)
             targets = np.tile(np.asarray(plan.goal_lps), (len(at), 1))
             if procedure.imaging.measured:
                 shown = targets + errors.target_mm + procedure.imaging.position_mm * went.noise[:, 1, :3]
@@ -233,7 +220,7 @@ class _Run:
                 stage = procedure.tubes
                 seen = as_measured(true_tips, stage.position_mm, stage.direction_deg, went.noise[:, 0])
                 tips = policy.tips_measured(chosen, seen)
-                ends = ends_of(tips, as_pieces(chosen.arcs, 0.0))[:, :3, 3]
+                ends = truth.ends_of(tips, truth.as_pieces(chosen.arcs, 0.0))[:, :3, 3]
                 chosen = policy.from_tubes(chosen, tips, targets)
                 corrected = np.linalg.norm(ends - targets, axis=1)
                 found.decided["tube"].append(_Decided(~policy.goes_on(chosen.chances, 0), corrected))
@@ -242,8 +229,8 @@ class _Run:
                 arcs = self._steered(went, chosen, done, true_tips, targets, at, found)
             else:
                 longest_mm = plan.system.require_needle("A procedure").max_length_mm
-                arcs = needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, longest_mm)
-            pieces = as_pieces(arcs, plan.system.track_radius_mm)
+                arcs = truth.needles_carried_out(chosen.arcs, chosen.found[:, 1], errors, longest_mm)
+            pieces = truth.as_pieces(arcs, plan.system.track_radius_mm)
             pieces[:, 0, kernel.ROLL] -= rolled
             pieces = np.concatenate([tubes, pieces], axis=1)
         outcomes = self.assessor.follow(went.starts, pieces, n_tube, errors.target_mm, errors.border_mm)
@@ -279,12 +266,13 @@ class _Run:
                 continue
             path = ArcPath(lps_from_start=chosen.tips[n], arcs=chosen.arcs[n, : chosen.found[n, 1]])
             key = (_MEASURING, int(went.rows[n]), *self._number)
-            errors = rows_of(went.errors, np.array([n]))
-            attempt = Attempt(errors=errors, target_lps=policy.plan.goal_lps + errors.target_mm[0])
+            errors = truth.rows_of(went.errors, np.array([n]))
+            attempt = truth.Attempt(errors=errors, target_lps=policy.plan.goal_lps + errors.target_mm[0])
             branch = int(chosen.found[n, 2])
             query = Query(lps_from_start=path.lps_from_start, target=targets[n], branch=branch)
-            unknown = unknown_of(policy.errors, steering, policy.doubt_of(chosen.frames[n], chosen.tips[n]))
-            one = insert_needle(
+            doubt = policy.doubt_of(chosen.frames[n], chosen.tips[n])
+            unknown = truth.unknown_of(policy.errors, steering, doubt)
+            one = truth.insert_needle(
                 policy.environment, query, path, PolicyReplanner(policy, query, path), attempt, true_tips[n],
                 steering, unknown, np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key)),
             )  # fmt: skip

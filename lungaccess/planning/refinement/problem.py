@@ -10,15 +10,7 @@ from scipy import ndimage
 from anatomy.base.typed import Float
 from anatomy.structures import obstacle_bits
 from lungaccess.planning.refinement import boxes as fields
-from lungaccess.planning.refinement.layout import (
-    AXIS_DEGREE,
-    AXIS_SCALE_MM,
-    SLOPE_MM,
-    WALL_CONTACT_MM,
-    Layout,
-    Numbers,
-    ShapeModel,
-)
+from lungaccess.planning.refinement import layout
 from lungaccess.plans.candidate import Candidate, TipRows
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.task import Task
@@ -174,7 +166,7 @@ class Problem:
         rows = split(rows, arcs, self._exempt_mm)
         self.design = design = design_arrays(self.task.system.tubes)
         self.model = self._model(deployment.shape)
-        self.layout = Layout(
+        self.layout = layout.Layout(
             arcs=arcs,
             with_map=weights.mapped > 0.0,
             weighs_tubes=weights.tubes > 0.0,
@@ -190,7 +182,7 @@ class Problem:
         self.boxes = self._cut_boxes()
         lower, upper = self._variable_bounds()
         least, most = self._constraint_bounds()
-        self.numbers = Numbers(
+        self.numbers = layout.Numbers(
             parameters=self._parameters(self.axis.points, self.axis.tangents, self.model),
             lower=lower,
             upper=upper,
@@ -198,7 +190,7 @@ class Problem:
             most=most,
         )
 
-    def eased(self, values: Float) -> Numbers:
+    def eased(self, values: Float) -> layout.Numbers:
         """Return the numbers with the clearances of the start, `values` (m,), allowed where they are less.
 
         So the program starts from where it may be, though its fields are not exact.
@@ -211,7 +203,7 @@ class Problem:
             least[place] = np.minimum(least[place], values[place] - 1e-4)
         return replace(self.numbers, least=least)
 
-    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape) -> Numbers:
+    def for_needle(self, x: Float, tip: ScopeTip, shape: TubeShape) -> layout.Numbers:
         """Return the numbers for the needle alone, from the tubes of `x` and a tip that stay as they are."""
         rows, numbers = self.layout.constraints, self.numbers
         lower, upper = numbers.lower.copy(), numbers.upper.copy()
@@ -222,10 +214,10 @@ class Problem:
             if name in rows:
                 least[rows[name]], most[rows[name]] = -np.inf, np.inf
         parameters = self._parameters(*one_tip(tip), self._model(shape, constant=True))
-        return Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
+        return layout.Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
-    def _model(self, shape: TubeShape, *, constant: bool = False) -> ShapeModel:
-        return ShapeModel(self.design, shape, self.longest_mm, constant=constant)
+    def _model(self, shape: TubeShape, *, constant: bool = False) -> layout.ShapeModel:
+        return layout.ShapeModel(self.design, shape, self.longest_mm, constant=constant)
 
     @property
     def sideways(self) -> Float:
@@ -243,7 +235,7 @@ class Problem:
         bits = obstacle_bits(fissures)
         leaves = deployment.exit_mm
         outside = self._tube_points(np.linspace(leaves, deployment.inner_mm, 12))
-        inside = self._tube_points(np.linspace(max(leaves - WALL_CONTACT_MM, 0.0), leaves, 6))
+        inside = self._tube_points(np.linspace(max(leaves - layout.WALL_CONTACT_MM, 0.0), leaves, 6))
         needle, lengths = self._candidate.path.sample(1.0)
         near = np.concatenate([outside, needle[lengths <= self._exempt_mm]])
         costed = np.concatenate([needle, outside]) if self.layout.weighs_tubes else needle
@@ -264,13 +256,13 @@ class Problem:
         """Return the share of lumen at the exit, and its greatest slope there, per mm."""
         box = self.boxes[fields.LUMEN_SHARE]
         exit_point = self._tube_points(np.array([self._candidate.deployment.exit_mm]))
-        places = exit_point + SLOPE_MM * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+        places = exit_point + layout.SLOPE_MM * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
         lattice = places @ box.lattice_from_lps[:, :3].T + box.lattice_from_lps[:, 3]
         values = box.values.reshape(box.shape, order="F")
         share = ndimage.map_coordinates(values, lattice.T, order=3, prefilter=False, mode="nearest")
-        return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * SLOPE_MM))
+        return float(share[0]), float(np.linalg.norm(share[1:4] - share[4:]) / (2.0 * layout.SLOPE_MM))
 
-    def _parameters(self, points: Float, tangents: Float, model: ShapeModel) -> Float:
+    def _parameters(self, points: Float, tangents: Float, model: layout.ShapeModel) -> Float:
         """Return the parameters for an axis of the scope's tip given by coefficients and a model."""
         tubes = self.task.system.tubes
         steps = -np.diff(
@@ -372,7 +364,7 @@ class LocalAxis:
     def __init__(self, rows: TipRows, tip: ScopeTip) -> None:
         self._rows, self._tip = rows, tip
         # Step in which poses of the tip are proved and fitted; a voxel is several times as large.
-        shifts = evenly(0.125, AXIS_SCALE_MM)
+        shifts = evenly(0.125, layout.AXIS_SCALE_MM)
         row = rows.along(tip, shifts)
         home = len(shifts) // 2
         refused = np.flatnonzero(~row.proved)
@@ -388,14 +380,14 @@ class LocalAxis:
 
 def one_tip(tip: ScopeTip) -> tuple[Float, Float]:
     """Return the coefficients of an axis that is one tip."""
-    points, tangents = np.zeros((3, AXIS_DEGREE + 1)), np.zeros((3, AXIS_DEGREE + 1))
+    points, tangents = np.zeros((3, layout.AXIS_DEGREE + 1)), np.zeros((3, layout.AXIS_DEGREE + 1))
     points[:, 0], tangents[:, 0] = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]
     return points, tangents
 
 
 def _fit(shifts: Float, tips: Float, home: int) -> tuple[Float, Float]:
     """Return the coefficients `(3, AXIS_DEGREE + 1)` of point and tangent; exact at no shift."""
-    powers = (shifts[:, None] / AXIS_SCALE_MM) ** np.arange(1, AXIS_DEGREE + 1)
+    powers = (shifts[:, None] / layout.AXIS_SCALE_MM) ** np.arange(1, layout.AXIS_DEGREE + 1)
     fitted = []
     for values in (tips[:, :3], tips[:, 3:6]):
         rest = np.linalg.lstsq(powers, values - values[home], rcond=1e-9)[0]

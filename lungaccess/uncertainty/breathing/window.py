@@ -17,14 +17,6 @@ from lungaccess.plans.plan import Plan
 from lungaccess.plans.window import BreathingWindow, WindowLimit
 from lungaccess.uncertainty.breathing.kernels import rules
 from lungaccess.uncertainty.breathing.kernels.rigid import Rigid
-from lungaccess.uncertainty.breathing.kernels.rules import (
-    BEFORE_WALL,
-    IN_LUMEN,
-    IN_WALL,
-    NEEDLE,
-    NEEDLE_AT_EXIT,
-    TUBE,
-)
 from lungaccess.uncertainty.breathing.kernels.window import MOST_LEAVES, divide
 
 SHORTEST_MM = 1e-9
@@ -66,11 +58,12 @@ def device_points(plan: Plan) -> DevicePoints:
     at_exit = (way_out - zone, way_out, way_out + zone)
     edges = _edges([*at_exit, length, *tube.insertions_mm(system.tubes)], length)
     extra = system.margins.total_mm + tube.clearance_loss_mm
+    kinds = (rules.IN_LUMEN, rules.BEFORE_WALL, rules.IN_WALL, rules.TUBE)
     parts, rows = [], []
     for begin, end in zip(edges[:-1], edges[1:], strict=True):
         middle = 0.5 * (begin + end)
         radius = float(tube_radii(tube, system.tubes, np.array([middle]))[0])
-        kind = (IN_LUMEN, BEFORE_WALL, IN_WALL, TUBE)[sum(middle > edge for edge in at_exit)]
+        kind = kinds[sum(middle > edge for edge in at_exit)]
         parts.append(_arcs(begin, end))
         rows.append((kind, radius + extra, radius))
     points = [points_on_pieces(plan.scope.lps_from_scope_tip, pieces, arcs) for arcs in parts]
@@ -78,7 +71,7 @@ def device_points(plan: Plan) -> DevicePoints:
         exempt = plan.exemption.needle_length_mm
         edges = _edges([exempt, needle.length_mm], needle.length_mm)
         for begin, end in zip(edges[:-1], edges[1:], strict=True):
-            kind = NEEDLE_AT_EXIT if 0.5 * (begin + end) < exempt else NEEDLE
+            kind = rules.NEEDLE_AT_EXIT if 0.5 * (begin + end) < exempt else rules.NEEDLE
             arcs = _arcs(begin, end)
             points.append(points_on_pieces(needle.lps_from_start, needle_pieces(needle), arcs))
             parts.append(length + arcs)

@@ -17,18 +17,7 @@ from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from lungaccess.planning.coupled.kernels.tubes_cost import bent_towards, cost_in_tissue
 from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
-from stages.tube.kernels import (
-    ACCEPTED,
-    BRANCH,
-    LEFT_AT,
-    WALL_RUN,
-    near_shape,
-    required_beside,
-    take_over,
-    tip_of_arcs,
-    validate_arcs,
-    whole_way,
-)
+from stages.tube import kernels
 
 SCOPE_POSE = 0
 ROTATION = 1
@@ -106,16 +95,16 @@ def _shape_nearby(design, near, shape, x):
         shape.joints[n + i] = x[INSERTED + 2 * n - 1 - i]
         same = same and shape.joints[i] == near.joints[i] and shape.joints[n + i] == near.joints[n + i]
     if same:
-        take_over(shape, near)
+        kernels.take_over(shape, near)
         return True, True
-    return near_shape(design, near, shape), False
+    return kernels.near_shape(design, near, shape), False
 
 
 @inner_kernel
 def why_refused(environment, constants, shape, base, towards, trace, tip):
     """Return ACCEPTED, or why a shape from a scope tip `base` (6,) is refused; see `validate_arcs`."""
-    arcs = shape.arcs[: shape.number[0]]
-    return validate_arcs(environment, constants, base, towards, arcs, required_beside(shape), trace, tip)
+    arcs, beside = shape.arcs[: shape.number[0]], kernels.required_beside(shape)
+    return kernels.validate_arcs(environment, constants, base, towards, arcs, beside, trace, tip)
 
 
 @inner_kernel
@@ -135,14 +124,14 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
     found, followed = _shape_nearby(design, near, shape, x)
     if not found:
         return math.inf
-    pose = tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
+    pose = kernels.tip_of_arcs(base, normal, shape.arcs[: shape.number[0]])
     cost = _needle_cost(needle, pose, vias, count, target, cost_limit)
     if cost == math.inf:
         return math.inf
     towards = np.array(normal)
-    if not followed and not whole_way(design, shape):
+    if not followed and not kernels.whole_way(design, shape):
         return math.inf
-    if why_refused(environment, constants, shape, base[:6], towards, trace, tip) != ACCEPTED:
+    if why_refused(environment, constants, shape, base[:6], towards, trace, tip) != kernels.ACCEPTED:
         return math.inf
     if not followed:
         pose = (tip[0], tip[1], tip[2], tip[3], tip[4], tip[5])
@@ -155,11 +144,11 @@ def validated_cost(tube, needle, scope_poses, allowed, x, vias, count, target, c
         base,
         normal,
         shape.arcs[: shape.number[0]],
-        trace[LEFT_AT] + trace[WALL_RUN],
+        trace[kernels.LEFT_AT] + trace[kernels.WALL_RUN],
     )
     if not cost < cost_limit:
         return math.inf
-    branch = int(trace[BRANCH])
+    branch = int(trace[kernels.BRANCH])
     if not _needle_clear(needle, pose, vias, count, target, branch):
         return math.inf
     return cost

@@ -25,21 +25,7 @@ from lungaccess.planning.coupled.kernels.box_of_tubes import (
     times,
     tubes_of,
 )
-from stages.tube.kernels import (
-    CORNER_MM,
-    CURVED_LENGTH,
-    FINE_STEP_MM,
-    INNER_CURVATURE,
-    INNER_RADIUS,
-    LOOK_MM,
-    MARGIN,
-    OUTER_RADIUS,
-    OVERLAP_CURVATURE,
-    SWEEP_SAMPLES,
-    UNNOTICED_MM,
-    off_track,
-    refused_exits,
-)
+from stages.tube import kernels
 
 ACROSS, UP, SIDES = 0, 1, 5
 BOUND, TIP, AWAY, WIDE, LOSS = 5, 6, 7, 13, 14
@@ -102,22 +88,22 @@ def least_sweep(tubes, box):
     It looks at where the inner tube's curve ends, and at the sample at which the middle deployment sweeps
     most.  docs/theory/cost_bound.md derives how both change with the insertions.
     """
-    curved, inner, outer = tubes[CURVED_LENGTH], box[INNER], box[OUTER]
+    curved, inner, outer = tubes[kernels.CURVED_LENGTH], box[INNER], box[OUTER]
     longest, first_outer = inner + box[HALF + INNER], max(outer - box[HALF + OUTER], 0.0)
     if inner - box[HALF + INNER] <= curved or outer > inner:
         return 0.0
-    unlike = abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE])
-    opening = abs(tubes[OVERLAP_CURVATURE])
+    unlike = abs(tubes[kernels.OVERLAP_CURVATURE] - tubes[kernels.INNER_CURVATURE])
+    opening = abs(tubes[kernels.OVERLAP_CURVATURE])
     if longest - curved > first_outer:
-        opening = max(opening, abs(tubes[INNER_CURVATURE]))
-    least = off_track(tubes, outer, inner, curved) - opening * curved * box[HALF + INNER]
+        opening = max(opening, abs(tubes[kernels.INNER_CURVATURE]))
+    least = kernels.off_track(tubes, outer, inner, curved) - opening * curved * box[HALF + INNER]
     least -= 2.0 * unlike * max(curved - first_outer, 0.0) * box[HALF + OUTER]
     if opening * curved * box[HALF + INNER] < LOOSE_SWEEP_MM:
         greatest = share = 0.0
-        for m in range(SWEEPS_EVERY, SWEEP_SAMPLES + 1, SWEEPS_EVERY):
-            off = off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES)
+        for m in range(SWEEPS_EVERY, kernels.SWEEP_SAMPLES + 1, SWEEPS_EVERY):
+            off = kernels.off_track(tubes, outer, inner, inner * m / kernels.SWEEP_SAMPLES)
             if off > greatest:
-                greatest, share = off, m / SWEEP_SAMPLES
+                greatest, share = off, m / kernels.SWEEP_SAMPLES
         by_inner = opening * (curved + share * ((1.0 - share) * longest + curved))
         greatest -= by_inner * box[HALF + INNER]
         greatest -= 2.0 * unlike * max(share * longest - first_outer, 0.0) * box[HALF + OUTER]
@@ -190,7 +176,7 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
     first_outer, longer = box[OUTER] - box[HALF + OUTER], 2.0 * box[HALF + INNER]
     shortest = max(box[INNER] - box[HALF + INNER], 0.0)
     hazards, bits = surroundings.hazard_bits, surroundings.bits
-    beside = tubes[MARGIN] + sweep - SPARE
+    beside = tubes[kernels.MARGIN] + sweep - SPARE
     left, branches = False, (NONE, NONE)
     refused = other_refused = touching = False
     refuted = 0.0  # Tubes that leave before this arc length are refused.
@@ -199,7 +185,7 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
         point, away = sample_of(tubes, family, s)
         x, y, z = point
         deep = distance_bound(surroundings.depth, surroundings.depth_geometry, x, y, z)
-        radius = tubes[OUTER_RADIUS] if s <= first_outer else tubes[INNER_RADIUS]
+        radius = tubes[kernels.OUTER_RADIUS] if s <= first_outer else tubes[kernels.INNER_RADIUS]
         reach = radius + beside - away
         if not left:
             step = max(min(TUBE_STEP_MM, 2.0 * away), LEAST_STEP_MM, away)
@@ -208,7 +194,7 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
                 step = max(step, 0.5 * (deep - away))
             else:
                 around = away + back
-                branches = _branches_of_lumen(surroundings, point, around + 2.0 * CORNER_MM, branches)
+                branches = _branches_of_lumen(surroundings, point, around + 2.0 * kernels.CORNER_MM, branches)
             deepest = most_distance(surroundings.depth, surroundings.depth_geometry, x, y, z) + away
             touching = touching and deepest + back < radius
             if deep < away + radius and s >= looked and reach > 0.0:
@@ -218,18 +204,18 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
                 lack = reach - near
                 looked = s + abs(lack)  # Before, the same holds by and large.
                 if lack > 0.0:
-                    refuted = max(refuted, refused_exits(tubes, s, lack, first_outer))
-                    touching = touching or deepest + FINE_STEP_MM < radius
+                    refuted = max(refuted, kernels.refused_exits(tubes, s, lack, first_outer))
+                    touching = touching or deepest + kernels.FINE_STEP_MM < radius
             if touching or refuted >= s:
                 branches = (NONE, NONE)
-            left = deep <= 0.0 and not _within(surroundings, point, LUMEN, -1, away + UNNOTICED_MM)
+            left = deep <= 0.0 and not _within(surroundings, point, LUMEN, -1, away + kernels.UNNOTICED_MM)
             if left and (touching or refuted >= s):
                 return True
             if left and branches[0] != SEVERAL:
                 refused = _must_not_leave(surroundings, branches[0])
                 other_refused = _must_not_leave(surroundings, branches[1])
         if left:
-            if deep > away + LOOK_MM:
+            if deep > away + kernels.LOOK_MM:
                 return True
             if branches[0] == SEVERAL:
                 refused = other_refused = _within(surroundings, point, hazards, -1, reach)
@@ -241,7 +227,9 @@ def tubes_blocked(surroundings, tubes, family, box, sweep):
             clear = distance_bound(surroundings.clearance, surroundings.geometry, x, y, z)
             step = max(TUBE_STEP_MM, away, clear - radius - beside - away)
         if s >= shortest:
-            if not left and (refuted >= s + longer or (touching and deepest + longer < tubes[INNER_RADIUS])):
+            if not left and (
+                refuted >= s + longer or (touching and deepest + longer < tubes[kernels.INNER_RADIUS])
+            ):
                 return True
             return deep > away + longer + SPARE
         back = min(step, shortest - s)

@@ -13,23 +13,7 @@ from anatomy.base.typed import Bool, Float, Int, UInt16
 from anatomy.kernels.arcs import arc_to_point, normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel
 from anatomy.kernels.field import distance_bound
-from lungaccess.planning.procedure.kernels.spread import (
-    CAP,
-    SMALL,
-    Around,
-    add,
-    clearance_at,
-    cross,
-    dot,
-    margin_of,
-    of_insertion,
-    of_scope,
-    reach_margin,
-    shift,
-    tilt,
-    tube_margin,
-    unit,
-)
+from lungaccess.planning.procedure.kernels import spread
 from lungaccess.uncertainty.risk.kernels.chain import BORDER, TARGET, TILT, TUBE_PIECES, find_end, set_planar
 from lungaccess.uncertainty.risk.kernels.deviation import N_PIECE, follow
 from stages.needle.kernels import Limits, Obstacles, blocker_on_arc, single_arc_exceeds
@@ -57,7 +41,7 @@ class Scene(NamedTuple):
     from its centre it is aimed at where that cannot be reached.
     """
 
-    around: Around
+    around: spread.Around
     obstacles: Obstacles
     limits: Limits
     judged: Obstacles
@@ -98,13 +82,13 @@ def _below(standard):
 def _goal_chance(offset, sums, radius):
     """Return the chance to end within a radius, of a sum of chi-squares [Satterthwaite1946, Wilson1931]."""
     x, y, z = offset
-    mean = sums[0] + sums[1] + sums[2] + dot(offset, offset)
+    mean = sums[0] + sums[1] + sums[2] + spread.dot(offset, offset)
     squares = sums[0] ** 2 + sums[1] ** 2 + sums[2] ** 2
     squares += 2.0 * (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2)
     across = sums[0] * x * x + sums[1] * y * y + sums[2] * z * z
     across += 2.0 * (sums[3] * x * y + sums[4] * x * z + sums[5] * y * z)
     variance = 2.0 * squares + 4.0 * across
-    if variance < SMALL:
+    if variance < spread.SMALL:
         return 1.0 if mean <= radius * radius else 0.0
     ninths = variance / (9.0 * mean * mean)
     return _below(((radius * radius / mean) ** (1.0 / 3.0) - 1.0 + ninths) / math.sqrt(ninths))
@@ -116,29 +100,29 @@ def _of_tip(sizes, point, base, forward, about, at, ahead):
     nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if sizes.tip_known:
         arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
-        return tilt(shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
-    sums = of_scope(sizes, nothing, point, base, forward)
-    return of_insertion(sizes, sums, point, at, ahead, about)
+        return spread.tilt(spread.shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
+    sums = spread.of_scope(sizes, nothing, point, base, forward)
+    return spread.of_insertion(sizes, sums, point, at, ahead, about)
 
 
 @inner_kernel
 def _moved(moves, point):
     """Return what an error `(6,)` does to a point, see the module."""
-    turned = cross((moves[0], moves[1], moves[2]), point)
+    turned = spread.cross((moves[0], moves[1], moves[2]), point)
     return turned[0] - moves[3], turned[1] - moves[4], turned[2] - moves[5]
 
 
 @inner_kernel
 def _turned_normal(pose, normal, roll):
     c, s = math.cos(roll), math.sin(roll)
-    b = cross((pose[3], pose[4], pose[5]), normal)
+    b = spread.cross((pose[3], pose[4], pose[5]), normal)
     return c * normal[0] + s * b[0], c * normal[1] + s * b[1], c * normal[2] + s * b[2]
 
 
 @inner_kernel
 def _set_turn(moves, t, r, sign):
     """Add a turn about the axis `t` through the point `r` to an error `(6,)`."""
-    u = cross(t, r)
+    u = spread.cross(t, r)
     for m in range(3):
         moves[m] += sign * t[m]
         moves[3 + m] += sign * u[m]
@@ -153,20 +137,20 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, ne
     chance below `needed` is of no use, and is returned as 0 as soon as that is known.
     """
     at, ahead = (tip[0, 3], tip[1, 3], tip[2, 3]), (tip[0, 2], tip[1, 2], tip[2, 2])
-    about, _size = unit(cross(forward, ahead))
+    about, _size = spread.unit(spread.cross(forward, ahead))
     normal = (tip[0, 0], tip[1, 0], tip[2, 0])
     pose = (at[0], at[1], at[2], ahead[0], ahead[1], ahead[2])
     rolls[: count + 1] = 0.0
     curved = rolls[count]
     spacing = max(arcs[:count, 0].sum() / STATIONS, 1e-6)
-    least, done, point = CAP, 0.0, at
+    least, done, point = spread.CAP, 0.0, at
     sums = _of_tip(sizes, at, base, forward, about, at, ahead)
     for a in range(count):
         length, kappa = arcs[a, 0], arcs[a, 2]
         normal = _turned_normal(pose, normal, arcs[a, 1])
         bend = (kappa, normal[0], normal[1], normal[2])
         t, r = (pose[3], pose[4], pose[5]), (pose[0], pose[1], pose[2])
-        axis = cross(t, normal)
+        axis = spread.cross(t, normal)
         _set_turn(rolls[a], t, r, 1.0)
         steps = max(int(math.ceil(length / spacing - 1e-9)), 1)
         for k in range(steps):
@@ -174,15 +158,15 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, ne
             _set_turn(curved, axis, point_on_arc(pose, bend, (k + 0.5) * step), kappa * step)
             point = point_on_arc(pose, bend, (k + 1) * step)
             sums = _of_tip(sizes, point, base, forward, about, at, ahead)
-            sums = add(sums, sizes.curvature, _moved(curved, point))
+            sums = spread.add(sums, sizes.curvature, _moved(curved, point))
             for e in range(a + 1):
-                sums = add(sums, sizes.roll, _moved(rolls[e], point))
+                sums = spread.add(sums, sizes.roll, _moved(rolls[e], point))
             if done + (k + 1) * step > sizes.exempt:
                 x, y, z = point
                 clear = distance_bound(scene.obstacles.clearance, scene.obstacles.geometry, x, y, z)
             else:
-                clear = clearance_at(scene.around, point, False)
-            margin = margin_of(clear - sizes.needle_radius, sums)
+                clear = spread.clearance_at(scene.around, point, False)
+            margin = spread.margin_of(clear - sizes.needle_radius, sums)
             if margin < least:
                 least = margin
                 if _below(least) < needed:
@@ -191,8 +175,8 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, ne
         pose = pose_on_arc(pose, bend, length)
         done += length
         _set_turn(rolls[a], (pose[3], pose[4], pose[5]), (pose[0], pose[1], pose[2]), -1.0)
-    sums = add(shift(sums, sizes.target), sizes.stop, (pose[3], pose[4], pose[5]))
-    sums = add(sums, sizes.breathing, (0.0, 0.0, 1.0))
+    sums = spread.add(spread.shift(sums, sizes.target), sizes.stop, (pose[3], pose[4], pose[5]))
+    sums = spread.add(sums, sizes.breathing, (0.0, 0.0, 1.0))
     offset = (point[0] - target[0], point[1] - target[1], point[2] - target[2])
     return _goal_chance(offset, sums, scene.radius) * _below(least)
 
@@ -216,8 +200,8 @@ def _path_through(limits, tip, vias, count, target, arcs):
         if single_arc_exceeds(limits, bend, long, turned):
             return False
         towards = (bend[1], bend[2], bend[3])
-        side = cross((pose[3], pose[4], pose[5]), normal)
-        roll = math.atan2(dot(towards, side), dot(towards, normal))
+        side = spread.cross((pose[3], pose[4], pose[5]), normal)
+        roll = math.atan2(spread.dot(towards, side), spread.dot(towards, normal))
         arcs[a, 0], arcs[a, 1], arcs[a, 2] = length, roll, bend[0]
         normal = normal_on_arc(pose, bend, length)
         pose = pose_on_arc(pose, bend, length)
@@ -247,14 +231,14 @@ def _reach_chance(scene, sizes, base, forward, tip, target):
     if not scene.replanned:
         return 1.0
     at, ahead = (tip[0, 3], tip[1, 3], tip[2, 3]), (tip[0, 2], tip[1, 2], tip[2, 2])
-    about, _size = unit(cross(forward, ahead))
+    about, _size = spread.unit(spread.cross(forward, ahead))
     offset = (target[0] - at[0], target[1] - at[1], target[2] - at[2])
-    along = dot(offset, ahead)
+    along = spread.dot(offset, ahead)
     x, y, z = along * ahead[0], along * ahead[1], along * ahead[2]
-    normal, off = unit((offset[0] - x, offset[1] - y, offset[2] - z))
-    sums = of_scope(sizes, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), target, base, forward)
-    sums = of_insertion(sizes, sums, target, at, ahead, about)
-    return _below(reach_margin(sizes, along, off, normal, sums))
+    normal, off = spread.unit((offset[0] - x, offset[1] - y, offset[2] - z))
+    sums = spread.of_scope(sizes, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), target, base, forward)
+    sums = spread.of_insertion(sizes, sums, target, at, ahead, about)
+    return _below(spread.reach_margin(sizes, along, off, normal, sums))
 
 
 @inner_kernel
@@ -352,7 +336,7 @@ def find_places(places, measured, size, fallback, luck, likely, drawn):
         for m in range(places.shape[0]):
             x, y = places[m, 0] - measured[n, 0], places[m, 1] - measured[n, 1]
             z = places[m, 2] - measured[n, 2]
-            weights[m] = math.exp(-0.5 * (x * x + y * y + z * z) / max(size * size, SMALL))
+            weights[m] = math.exp(-0.5 * (x * x + y * y + z * z) / max(size * size, spread.SMALL))
             total += weights[m]
             squares += weights[m] * weights[m]
         if total * total < FEW * squares or squares == 0.0:
@@ -426,7 +410,7 @@ def choose_tubes(
                     for k in range(4):
                         tip[i, j] += frame[i, k] * choices.scope_from_tip[c, k, j]
             at, ahead = (tip[0, 3], tip[1, 3], tip[2, 3]), (tip[0, 2], tip[1, 2], tip[2, 2])
-            margin = tube_margin(
+            margin = spread.tube_margin(
                 scene.around, known, base, forward, at, ahead, choices.exits[c], choices.lengths[c]
             )
             tubes[c], needles[c] = _below(margin), 0.0 if scene.with_needle else 1.0
@@ -441,7 +425,7 @@ def choose_tubes(
                 if tubes[c] * reached > least:
                     straight[c] = paths[DIRECT, 0]
                     kinds[c] = DIRECT
-                    needed = least / max(tubes[c] * reached, SMALL)
+                    needed = least / max(tubes[c] * reached, spread.SMALL)
                     needles[c] = reached * path_chance(
                         scene, known, base, forward, tip, paths[DIRECT], 1, target, rolls, needed
                     )

@@ -9,20 +9,7 @@ from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, SPARE, minus, sample_of
 from stages.needle.infeasibility.kernels import BackwardReach, never_along
-from stages.tube.kernels import (
-    CORNER_MM,
-    CURVED_LENGTH,
-    INNER_CURVATURE,
-    INNER_RADIUS,
-    LOOK_MM,
-    MARGIN,
-    OUTER_RADIUS,
-    OVERLAP_CURVATURE,
-    UNNOTICED_MM,
-    lateral_sweep,
-    refused_exits,
-    sweep_slope,
-)
+from stages.tube import kernels
 
 LOOK_STEP_MM, FARTHEST_LOOK_MM = 5.0, 40.0
 """The path of the needle is looked at in such steps, as long as it is known so well."""
@@ -157,7 +144,7 @@ def _lacking(environment, point, away, required):
 @merged_kernel
 def _is_out(environment, point, away):
     """Tell whether all tubes that pass within `away` of a point are noticeably out of every lumen there."""
-    required = away + UNNOTICED_MM
+    required = away + kernels.UNNOTICED_MM
     bound = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
     if bound > required or bound + environment.loss_mm < required or away >= EXACT_BELOW_MM:
         return bound > required
@@ -177,25 +164,25 @@ def tubes_blocked(environment, tubes, family, box):
     """
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
-    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
-    loose = (half_outer + half_inner) * sweep_slope(most * tubes[CURVED_LENGTH])
+    most = max(abs(tubes[kernels.INNER_CURVATURE]), abs(tubes[kernels.OVERLAP_CURVATURE]))
+    loose = (half_outer + half_inner) * kernels.sweep_slope(most * tubes[kernels.CURVED_LENGTH])
     sweep = 0.0
-    if loose < LOOSE_SWEEP_MM and inner > tubes[CURVED_LENGTH]:
-        sweep = max(lateral_sweep(tubes, min(outer, inner), inner) - loose, 0.0)
+    if loose < LOOSE_SWEEP_MM and inner > tubes[kernels.CURVED_LENGTH]:
+        sweep = max(kernels.lateral_sweep(tubes, min(outer, inner), inner) - loose, 0.0)
     shortest, longest = max(inner - half_inner, 0.0), inner + half_inner
-    beside, first_outer = tubes[MARGIN] + sweep, outer - half_outer
+    beside, first_outer = tubes[kernels.MARGIN] + sweep, outer - half_outer
     may_leave = out = False
     refuted = s = 0.0  # Tubes that leave before the first of these arc lengths are refused.
     while True:
         point, away = sample_of(tubes, family, s)
         step = min(max(away, LEAST_STEP_MM), GREATEST_STEP_MM)
-        radius = tubes[OUTER_RADIUS] if s <= first_outer else tubes[INNER_RADIUS]
+        radius = tubes[kernels.OUTER_RADIUS] if s <= first_outer else tubes[kernels.INNER_RADIUS]
         lacking = _lacking(environment, point, away, radius + beside)
         deep = (
             distance_bound(environment.depth, environment.depth_geometry, point[0], point[1], point[2]) - away
         )
         if out:
-            if s <= shortest and (deep > LOOK_MM or lacking > SPARE):
+            if s <= shortest and (deep > kernels.LOOK_MM or lacking > SPARE):
                 return True
             to_lumen = distance_bound(environment.lumen, environment.geometry, point[0], point[1], point[2])
             step = max(step, min(-lacking, to_lumen))
@@ -204,8 +191,8 @@ def tubes_blocked(environment, tubes, family, box):
                 environment.may_be_left, environment.geometry, point[0], point[1], point[2]
             )
             if s <= shortest and lacking > SPARE:
-                refuted = max(refuted, refused_exits(tubes, s, lacking, first_outer))
-            may_here = to_allowed <= away + step + CORNER_MM and refuted < s + step
+                refuted = max(refuted, kernels.refused_exits(tubes, s, lacking, first_outer))
+            may_here = to_allowed <= away + step + kernels.CORNER_MM and refuted < s + step
             if (deep > 0.0 and s <= shortest) or refuted >= s:
                 may_leave = may_here
             else:

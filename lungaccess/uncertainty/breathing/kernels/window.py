@@ -8,32 +8,8 @@ from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import AIRWAY, LUMEN
 from anatomy.kernels.motion import displacement_at
+from lungaccess.uncertainty.breathing.kernels import rules
 from lungaccess.uncertainty.breathing.kernels.rigid import carried, rate_bounds, turned
-from lungaccess.uncertainty.breathing.kernels.rules import (
-    BEFORE_WALL,
-    BLOCKED,
-    BROKEN_MM,
-    CLEAR,
-    CORNER_MM,
-    HOLE_SHIFTS,
-    IN_LUMEN,
-    LEAST_STEP_MM,
-    LEAVES_LUMEN,
-    MOST_MM,
-    NEEDLE,
-    NEEDLE_AT_EXIT,
-    OUT_OF_LUMEN_MM,
-    TARGET_MISSED,
-    TUBE,
-    UNDECIDED,
-    Stretch,
-    gap_to_voxels,
-    place,
-    step_clear_of,
-    step_in_lumen,
-    step_left,
-    step_of,
-)
 
 FIRST_STRETCHES = 8
 """Stretches to begin with; few plans are proved in a wider one at once."""
@@ -60,7 +36,7 @@ def stretch_between(rigid, amplitude, reference, begin, end):
     rotation, rate = np.zeros((3, 3)), np.zeros((3, 3))
     turned(rigid.gradient, share, rotation, rate)
     most_rate, most_change = rate_bounds(rigid.gradient, abs(share) + half)
-    return Stretch(share, half, rotation, rate, most_rate, most_change)
+    return rules.Stretch(share, half, rotation, rate, most_rate, most_change)
 
 
 @inner_kernel
@@ -97,11 +73,11 @@ def _point_at(points, arc, n, s, ahead, out, at):
 @inner_kernel
 def _step_at(tissue, breath, rigid, stretch, point, row, guess):
     """Return the proved step at a point by the rule of its section, and the reason that limits it."""
-    rest, speed, lever = place(breath, rigid, stretch, point, guess)
+    rest, speed, lever = rules.place(breath, rigid, stretch, point, guess)
     kind = int(row[KIND])
-    if kind == IN_LUMEN:
-        return step_in_lumen(tissue, breath, stretch, guess, rest, speed, lever), LEAVES_LUMEN
-    return step_of(tissue, breath, stretch, guess, rest, speed, lever, kind, row[KEPT], row[RADIUS])
+    if kind == rules.IN_LUMEN:
+        return rules.step_in_lumen(tissue, breath, stretch, guess, rest, speed, lever), rules.LEAVES_LUMEN
+    return rules.step_of(tissue, breath, stretch, guess, rest, speed, lever, kind, row[KEPT], row[RADIUS])
 
 
 @merged_kernel
@@ -115,7 +91,7 @@ def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, 
             n += 1
         rest = _point_at(points, arc, n, s, n + 1, point, guess)
         step, reason = _step_at(tissue, breath, rigid, stretch, point, row, guess)
-        if step < min(LEAST_STEP_MM, rest):
+        if step < min(rules.LEAST_STEP_MM, rest):
             return n, reason
         if s >= arc[last]:
             return -1, 0
@@ -125,12 +101,13 @@ def _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, 
 @inner_kernel
 def _hazard_at(tissue, breath, rigid, stretch, point, row, guess):
     """Return the proved step back from a point in the lumen, infinite where the tube is free of the wall."""
-    rest, speed, lever = place(breath, rigid, stretch, point, guess)
+    rest, speed, lever = rules.place(breath, rigid, stretch, point, guess)
     depth = distance_bound(tissue.lumen, tissue.lumen_geometry, guess[0], guess[1], guess[2])
-    if step_left(stretch, breath, guess, rest, speed, lever, min(depth, MOST_MM), row[RADIUS]) >= 0.0:
+    reach = min(depth, rules.MOST_MM)
+    if rules.step_left(stretch, breath, guess, rest, speed, lever, reach, row[RADIUS]) >= 0.0:
         return math.inf, 0
     bits = np.int64(tissue.bits & ~AIRWAY)
-    return step_clear_of(tissue, breath, stretch, guess, rest, speed, lever, bits, _NOBODY, row[KEPT])
+    return rules.step_clear_of(tissue, breath, stretch, guess, rest, speed, lever, bits, _NOBODY, row[KEPT])
 
 
 @merged_kernel
@@ -138,7 +115,7 @@ def _comes_free(tissue, breath, rigid, stretch, points, sections, first, guess):
     """Tell whether a tube is free of the wall somewhere between a point and its exit."""
     for s in range(sections.shape[0]):
         row = sections[s]
-        if int(row[KIND]) > BEFORE_WALL:
+        if int(row[KIND]) > rules.BEFORE_WALL:
             continue
         for n in range(max(first, int(row[BEGIN])), int(row[END]) + 1):
             if _hazard_at(tissue, breath, rigid, stretch, points[n], row, guess)[0] == math.inf:
@@ -155,7 +132,7 @@ def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
     point = np.zeros(3)
     for at in range(sections.shape[0] - 1, -1, -1):
         row = sections[at]
-        if int(row[KIND]) != IN_LUMEN and int(row[KIND]) != BEFORE_WALL:
+        if int(row[KIND]) != rules.IN_LUMEN and int(row[KIND]) != rules.BEFORE_WALL:
             continue
         first = int(row[BEGIN])
         n, s = int(row[END]) - 1, arc[int(row[END])]
@@ -166,7 +143,7 @@ def _hazard(tissue, breath, rigid, stretch, points, arc, sections, guess):
             step, reason = _hazard_at(tissue, breath, rigid, stretch, point, row, guess)
             if step == math.inf:
                 return -1, 0
-            if step < min(LEAST_STEP_MM, rest):
+            if step < min(rules.LEAST_STEP_MM, rest):
                 if _comes_free(tissue, breath, rigid, stretch, points, sections, n, guess):
                     return -1, 0
                 return n, reason
@@ -202,7 +179,7 @@ def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done
     guess[:3] = points[min(done, points.shape[0] - 1)]
     for s in range(sections.shape[0]):
         row = sections[s]
-        if int(row[KIND]) != BEFORE_WALL and done <= int(row[END]):
+        if int(row[KIND]) != rules.BEFORE_WALL and done <= int(row[END]):
             n, reason = _refusal_in_section(tissue, breath, rigid, stretch, points, arc, row, done, guess)
             if n >= 0:
                 return n, reason, n
@@ -213,25 +190,25 @@ def refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done
 @inner_kernel
 def _excess(tissue, breath, rigid, stretch, point, row, reason, guess):
     """Return a bound of the clearance less what is required that holds in all phases of the stretch."""
-    rest, speed, lever = place(breath, rigid, stretch, point, guess)
+    rest, speed, lever = rules.place(breath, rigid, stretch, point, guess)
     kind = int(row[KIND])
-    if reason == LEAVES_LUMEN:
+    if reason == rules.LEAVES_LUMEN:
         out, _label = exact_distance(
             tissue.labels, tissue.geometry, guess[0], guess[1], guess[2], _LUMEN, _NOBODY, 1.0
         )
-        allowed = CORNER_MM - 2.0 * breath.hysteresis * lever
-        return -step_left(stretch, breath, guess, rest, speed, lever, out, allowed)
+        allowed = rules.CORNER_MM - 2.0 * breath.hysteresis * lever
+        return -rules.step_left(stretch, breath, guess, rest, speed, lever, out, allowed)
     bits, branch = tissue.bits, tissue.branch
-    if kind == NEEDLE:
+    if kind == rules.NEEDLE:
         branch = _NOBODY
-    elif kind == IN_LUMEN or kind == BEFORE_WALL:
+    elif kind == rules.IN_LUMEN or kind == rules.BEFORE_WALL:
         bits, branch = np.int64(bits & ~AIRWAY), _NOBODY
-    _step, over, _label = gap_to_voxels(
+    _step, over, _label = rules.gap_to_voxels(
         tissue, breath, stretch, guess, rest, speed, lever, bits, branch, row[KEPT]
     )
-    if kind == TUBE or kind == NEEDLE_AT_EXIT:
-        kept = row[RADIUS] if kind == NEEDLE_AT_EXIT else OUT_OF_LUMEN_MM
-        _step, lumen, _label = gap_to_voxels(
+    if kind == rules.TUBE or kind == rules.NEEDLE_AT_EXIT:
+        kept = row[RADIUS] if kind == rules.NEEDLE_AT_EXIT else rules.OUT_OF_LUMEN_MM
+        _step, lumen, _label = rules.gap_to_voxels(
             tissue, breath, stretch, guess, rest, speed, lever, _LUMEN, _NOBODY, kept
         )
         over = min(over, lumen)
@@ -250,7 +227,7 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
     guess[:3] = points[n]
     best = _excess(tissue, breath, rigid, stretch, points[n], row, reason, guess)
     hop = FIRST_HOP
-    while hop >= 1 and best >= BROKEN_MM:
+    while hop >= 1 and best >= rules.BROKEN_MM:
         better = False
         for m in (n + hop, n - hop):
             if row[BEGIN] <= m <= row[END]:
@@ -261,7 +238,7 @@ def _surely(tissue, breath, rigid, stretch, points, sections, n, reason):
                     break
         if not better:
             hop //= 2
-    return best < BROKEN_MM, n
+    return best < rules.BROKEN_MM, n
 
 
 @kernel()
@@ -295,7 +272,7 @@ def divide(
         top += 1
     count, last, exit_at = 0, points.shape[0] - 1, 0
     for s in range(sections.shape[0]):
-        if sections[s, KIND] <= BEFORE_WALL:
+        if sections[s, KIND] <= rules.BEFORE_WALL:
             exit_at = int(sections[s, END])
     while top > 0:
         top -= 1
@@ -305,30 +282,28 @@ def divide(
         stretch = stretch_between(rigid, amplitude, reference, begin, end)
         miss, change = miss_of_target(breath, rigid, stretch, points[last], target)
         shift, shifts = miss_of_target(breath, rigid, stretch, hole, hole)
-        state, reason, at = CLEAR, 0, -1
+        state, reason, at = rules.CLEAR, 0, -1
         if not miss + change <= tolerance:
-            state, reason, at = UNDECIDED, TARGET_MISSED, last
+            state, reason, at, suspect = rules.UNDECIDED, rules.TARGET_MISSED, last, -1
             if miss - change > tolerance:
-                state = BLOCKED
+                state = rules.BLOCKED
         elif not shift + shifts <= hole_limit:
-            state, reason, at = UNDECIDED, HOLE_SHIFTS, exit_at
+            state, reason, at, suspect = rules.UNDECIDED, rules.HOLE_SHIFTS, exit_at, -1
             if shift - shifts > hole_limit:
-                state = BLOCKED
+                state = rules.BLOCKED
         else:
             at, reason, done = refusal(tissue, breath, rigid, stretch, points, arc, sections, suspect, done)
             if at >= 0:
-                state = UNDECIDED
+                state = rules.UNDECIDED
                 blocked, at = _surely(tissue, breath, rigid, stretch, points, sections, at, reason)
-                in_airway = reason != LEAVES_LUMEN and sections[_row_of(sections, at), KIND] <= BEFORE_WALL
+                before_wall = sections[_row_of(sections, at), KIND] <= rules.BEFORE_WALL
+                in_airway = reason != rules.LEAVES_LUMEN and before_wall
+                # A place where the tube is free may yet make it count no more.
+                suspect = -1 if in_airway else at
                 if blocked and not (in_airway and end - begin > HAZARD_WIDTH):
-                    state = BLOCKED
-        if state == UNDECIDED and end - begin > LEAST_WIDTH:
+                    state = rules.BLOCKED
+        if state == rules.UNDECIDED and end - begin > LEAST_WIDTH:
             middle = 0.5 * (begin + end)
-            of_point = reason != TARGET_MISSED and reason != HOLE_SHIFTS
-            if of_point and reason != LEAVES_LUMEN and sections[_row_of(sections, at), KIND] <= BEFORE_WALL:
-                suspect = -1  # A place where the tube is free may yet make it count no more.
-            else:
-                suspect = at if of_point else -1
             for half, (first, until) in enumerate(((middle, end), (begin, middle))):
                 stack[top + half, 0], stack[top + half, 1] = first, until
                 stack[top + half, 2], stack[top + half, 3] = suspect, done
@@ -337,6 +312,6 @@ def divide(
         leaves[count, 0], leaves[count, 1], leaves[count, 2] = begin, end, state
         leaves[count, 3], leaves[count, 4] = reason, at
         count += 1
-        if state != CLEAR and not all_of_it:
+        if state != rules.CLEAR and not all_of_it:
             break
     return count

@@ -38,9 +38,7 @@ class PathSettings:
     sub_step_mm: Annotated[float, quantity("advance between two choices", above=0.0, at_most=50.0)] = 1.0
     weights: Weights = Weights()
     random_offsets: Annotated[bool, switch("whether candidates are moved at random")] = True
-    retreats: Annotated[int, Field(description="most retreats when stuck", strict=True, ge=0, le=10_000)] = (
-        200
-    )
+    retreats: Annotated[int, Field(description="most retreats if stuck", strict=True, ge=0, le=10_000)] = 200
     max_length_mm: Annotated[float, quantity("longest path", above=0.0, at_most=2000.0)] = 600.0
 
     def __post_init__(self) -> None:
@@ -72,14 +70,12 @@ class PathSearch:
     def run(self, start: ScopeState) -> ScopePath:
         """Return the path from a state that ends at the goal or comes nearest to it."""
         options = self._options
-        begin = np.zeros((1, 4))
-        # The potential at the tip of a state, infinity outside the lumen.
+        # The numbers of a first state: the potential at its tip is infinity outside the lumen.
+        row = np.zeros((1, 4))
         tip = tool_frames(self._environment.model, start.array[None])[0, :3, 3]
         voxel = self._environment.lumen.voxel_at(tip)
-        begin[0, 3] = float(self._environment.field.potential[voxel]) if voxel >= 0 else np.inf
-        states, info, end = self._compute_path(
-            start.array[None], begin, options.weights, options.look_ahead_mm
-        )
+        row[0, 3] = self._environment.field.potential[voxel] if voxel >= 0 else np.inf
+        states, info, end = self._compute_path(start.array[None], row, options.weights, options.look_ahead_mm)
         if self._environment.reproduction:
             return self._path(states, info, end == kernel.REACHED, 0)
         states, info = _cut(states, info)
@@ -89,8 +85,7 @@ class PathSearch:
         while end != kernel.REACHED and info[-1, 3] > enough and used < options.retreats:
             # The number of the state to which the scope is pulled back.
             retreat_mm = RETREATS_MM[used % len(RETREATS_MM)] * self._rng.uniform(0.5, 1.5)
-            behind = np.cumsum(info[::-1, 2])[::-1]
-            kept = int(np.flatnonzero(behind >= retreat_mm).max(initial=0))
+            kept = int(np.flatnonzero(np.cumsum(info[::-1, 2])[::-1] >= retreat_mm).max(initial=0))
             ahead = max(options.look_ahead_mm * float(self._rng.choice(LOOK_AHEADS)), options.sub_step_mm)
             more, more_info, new_end = self._compute_path(
                 states[: kept + 1], info[: kept + 1], self._random_weights(), ahead
@@ -124,9 +119,9 @@ class PathSearch:
         most = len(begin) + 1 + int(left_mm / min(self._least, look_ahead_mm))
         states, info = np.zeros((most, 14)), np.zeros((most, 4))
         states[: done + 1], info[: done + 1] = begin, begin_info
-        randomness = np.zeros(1, dtype=np.uint64)
-        if options.random_offsets:
-            randomness[0] = self._rng.integers(1, 2**62)
+        randomness = np.array(
+            [self._rng.integers(1, 2**62) if options.random_offsets else 0], dtype=np.uint64
+        )
         least = look_ahead_mm if self._environment.reproduction else self._least
         count, end = kernel.compute_path(
             self._environment.arrays, self._environment.scope, weights.array, self._goal.voxel,
@@ -247,11 +242,8 @@ class Advisor:
     def _weigh(self, state: ScopeState) -> Candidates:
         """Return the candidates of the longest look-ahead at which one is valid, or of the least."""
         look_ahead = self.options.look_ahead_mm
-        least = (
-            look_ahead
-            if self.environment.reproduction
-            else float(self.environment.lumen.grid.spacing_mm.min())
-        )
+        finest = float(self.environment.lumen.grid.spacing_mm.min())
+        least = look_ahead if self.environment.reproduction else finest
         while True:
             found, _ = evaluate_motions(self.environment, state, look_ahead, self.options.weights)
             if found.best >= 0 or look_ahead <= least:
@@ -261,10 +253,12 @@ class Advisor:
     def _choose(self, found: Candidates, state: ScopeState) -> tuple[Action, Motion, float]:
         if found.best >= 0:
             return "advance", found.motion(found.best), float(found.cost[found.best])
-        back = Motion(
-            advance_mm=-self.options.look_ahead_mm, twist_rad=state.twist_rad, bend_rad=state.bend_rad
+        away_mm = -self.options.look_ahead_mm
+        return (
+            "pull back",
+            Motion(advance_mm=away_mm, twist_rad=state.twist_rad, bend_rad=state.bend_rad),
+            0.0,
         )
-        return "pull back", back, 0.0
 
     def _evaluate(self, state: ScopeState, own: Motion) -> MotionEvaluation | None:
         most = self.options.look_ahead_mm
@@ -280,19 +274,16 @@ class Advisor:
 
     def thinner(self, start: ScopeState, *, seed: int = 0) -> tuple[ThinnerScope, ...]:
         """Return what thinner scopes reach from a state, thickest first, until one reaches the goal."""
-        results: list[ThinnerScope] = []
+        tried: list[ThinnerScope] = []
         model = self.environment.model
-        count = math.ceil((model.radius_mm - THINNEST_MM) / THINNER_STEP_MM)
-        for n in range(1, count + 1):
+        for n in range(1, math.ceil((model.radius_mm - THINNEST_MM) / THINNER_STEP_MM) + 1):
             radius = max(model.radius_mm - n * THINNER_STEP_MM, THINNEST_MM)
             environment = ScopeEnvironment(model=replace(model, radius_mm=radius), field=self.field)
             found = PathSearch(environment, self.goal, self.options, seed).run(start)
-            results.append(
-                ThinnerScope(radius_mm=radius, reached=found.reached, distance_mm=found.distance_mm)
-            )
+            tried.append(ThinnerScope(radius_mm=radius, reached=found.reached, distance_mm=found.distance_mm))
             if found.reached:
                 break
-        return tuple(results)
+        return tuple(tried)
 
 
 def start_state(lumen: Lumen, tree: AirwayTree, model: ScopeModel) -> ScopeState:

@@ -38,9 +38,7 @@ class ScopeModel:
     twist_high_deg: Annotated[float, quantity("largest twist", at_least=0.0, at_most=360.0)] = 90.0
     bend_low_deg: Annotated[float, quantity("least bend", at_least=-270.0, at_most=0.0)] = -90.0
     bend_high_deg: Annotated[float, quantity("largest bend", at_least=0.0, at_most=270.0)] = 120.0
-    bend_step_deg: Annotated[float, quantity("spacing of bends to choose from", above=0.0, at_most=45.0)] = (
-        5.0
-    )
+    bend_step_deg: Annotated[float, quantity("spacing of the bends tried", above=0.0, at_most=45.0)] = 5.0
 
     def __post_init__(self) -> None:
         most = max(-self.bend_low_deg, self.bend_high_deg)

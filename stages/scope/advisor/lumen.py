@@ -119,8 +119,7 @@ def lumen_of_lung(lung: Lung) -> Lumen:
 
     Raises AnatomyError if the lung has no lumen.
     """
-    mask = lung.mask("lumen")
-    return _lumen(mask, lung.tree.points_lps[0], lung.lumen_depth)
+    return _lumen(lung.mask("lumen"), lung.tree.points_lps[0], lung.lumen_depth)
 
 
 def lumen_of_mask(mask: Volume, root_lps: ArrayLike) -> Lumen:

@@ -1,6 +1,7 @@
 """The path of a scope: its states one sub-step apart, where its body lies, and instructions for a person."""
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -103,7 +104,7 @@ class ScopePath:
         chain = kinematics.joints(self.model, self.states[number])[0]
         pieces = max(1, math.ceil(self.model.link_mm / spacing_mm))
         share = (np.arange(pieces)[:, None] + 1.0) / pieces
-        links = [a + share * (b - a) for a, b in zip(chain[:-1], chain[1:], strict=True)]
+        links = [a + share * (b - a) for a, b in pairwise(chain)]
         return np.concatenate([np.array(shaft), *links])
 
 
@@ -164,11 +165,10 @@ def _pieces(path: ScopePath, number: int, spacing_mm: float, turn_rad: float) ->
     before, after = path.states[number - 1], path.states[number]
     step = float(path.steps_mm[number])
     twist, bend = abs(float(after[12] - before[12])), abs(float(after[13] - before[13]))
-    tightest = 2.0 * math.tan(0.5 * abs(float(after[13])) / path.model.links) / path.model.link_mm
-    turned = tightest * step
-    reach = path.model.length_mm + path.model.link_mm
-    moved = step + reach * (turned + twist + bend)
-    return max(1, math.ceil(moved / spacing_mm), math.ceil((turned + twist + bend) / turn_rad))
+    curvature = 2.0 * math.tan(0.5 * abs(float(after[13])) / path.model.links) / path.model.link_mm
+    turned = curvature * step + twist + bend
+    moved = step + (path.model.length_mm + path.model.link_mm) * turned
+    return max(1, math.ceil(moved / spacing_mm), math.ceil(turned / turn_rad))
 
 
 DIRECTIONS = (
@@ -251,7 +251,7 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
     carina = float(tree.distance_from_root_mm[tree.carina_point])
     instructions: list[Instruction] = []
     twist_before = math.degrees(path.states[0, 12])
-    for number, (begin, end) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for begin, end in pairwise(starts):
         here = int(branch[begin])
         twist, bend = np.degrees(path.states[begin, 12:14]).tolist()
         bends = np.degrees(path.states[begin:end, 13])
@@ -260,7 +260,7 @@ def instructions_along(path: ScopePath, tree: AirwayTree) -> tuple[Instruction, 
                 branch=here,
                 generation=int(tree.generation[here]),
                 from_carina_mm=float(tree.distance_from_root_mm[_first_point(tree, here)]) - carina,
-                heading=_heading(tree, here) if number else "",
+                heading=_heading(tree, here) if begin else "",
                 rotate_deg=twist - twist_before,
                 twist_deg=twist,
                 bend_deg=bend,

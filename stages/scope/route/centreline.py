@@ -100,14 +100,11 @@ class Centreline:
         """Raise `TargetError` unless a point lies at least `needed_mm` deep in the lumen."""
         depth = float(self.depth_mm(point_mm)[0])
         if not depth >= needed_mm:
-            nearest = self.nodes_mm[self.nearest_node(point_mm)]
-            near = ", ".join(f"{x:.1f}" for x in nearest)
-            where = (
-                f"outside the lumen; the nearest point of the centreline, ({near}), is "
-                f"{np.linalg.norm(nearest - point_mm):.1f} mm away"
-                if depth < 0
-                else f"{depth:.2f} mm inside the lumen"
-            )
+            where = f"{depth:.2f} mm inside the lumen"
+            if depth < 0:
+                nearest = self.nodes_mm[self.nearest_node(point_mm)]
+                near, away = ", ".join(f"{x:.1f}" for x in nearest), np.linalg.norm(nearest - point_mm)
+                where = f"outside the lumen; the centreline's nearest point, ({near}), is {away:.1f} mm away"
             raise TargetError(
                 f"The {name} of the route lies {where}",
                 expected=f"at least {needed_mm:g} mm inside it, the radius of the device with its margin",
@@ -117,8 +114,7 @@ class Centreline:
 
 def from_tree(tree: AirwayTree) -> Centreline:
     """Return the centreline of a tree as it is; where a gap was bridged the radius is 0."""
-    child = np.arange(1, tree.n_points)
-    edges = np.stack((tree.parent_point[1:], child), axis=1)
+    edges = np.stack((tree.parent_point[1:], np.arange(1, tree.n_points)), axis=1)
     return Centreline(nodes_mm=tree.points_lps, radius_mm=tree.radius_mm, edges=edges)
 
 
@@ -140,15 +136,12 @@ def from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) ->
 def from_lung(lung: Lung) -> Centreline:
     """Return the centreline of the airway with radii proved against the lumen mask."""
     base = from_tree(lung.tree)
-    return _proved(
-        *_refined(base.nodes_mm, base.edges),
-        _Walls(lung.mask("lumen").array, lung.grid, SOLID, lung.lumen_depth),
-    )
+    walls = _Walls(lung.mask("lumen").array, lung.grid, SOLID, lung.lumen_depth)
+    return _proved(*_refined(base.nodes_mm, base.edges), walls)
 
 
 def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
-    """Return the centreline of any branching tube, not zero in a mask: vein, artery or airway, without a
-    root.
+    """Return the centreline of any branching tube, not zero in a mask: vein, artery or airway, no root.
 
     It is the skeleton of the largest piece of the mask, smoothed, with radii proved against the mask (voxels
     as solid boxes).  Raises AnatomyError if the mask is empty, or too small for a line.
@@ -171,8 +164,7 @@ def from_mask(mask: Volume, *, rounded: bool = False) -> Centreline:
         )
     walls = _Walls(prepared.lumen, grid, CENTRES if rounded else SOLID)
     used, edges = np.unique(np.array(pairs), return_inverse=True)
-    nodes = _smoothed(grid.lps(skeleton.ijk[used]), edges.reshape(-1, 2), walls)
-    return _proved(*_refined(nodes, edges.reshape(-1, 2)), walls)
+    return _of_skeleton(grid.lps(skeleton.ijk[used]), edges.reshape(-1, 2), walls)
 
 
 def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
@@ -197,12 +189,10 @@ def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
     framed = np.pad(picture.T, 1)
     # Three equal layers: in the middle one only the walls of the drawing are near.
     slab = np.repeat(framed[:, :, None], 3, axis=2)
-    corner = np.full(3, -pixel_mm)
-    grid = Grid.from_spacing(slab.shape, (pixel_mm, pixel_mm, pixel_mm), corner)
+    grid = Grid.from_spacing(slab.shape, (pixel_mm, pixel_mm, pixel_mm), np.full(3, -pixel_mm))
     walls = _Walls(slab, grid, SOLID)
     labels, _count = ndimage.label(framed, np.ones((3, 3), dtype=bool))
-    largest = labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))
-    ij = np.argwhere(skeletonize(largest))
+    ij = np.argwhere(skeletonize(labels == 1 + int(np.argmax(np.bincount(labels.ravel())[1:]))))
     edges = KDTree(ij).query_pairs(1.5, output_type="ndarray").astype(np.int64)
     if not len(edges):
         raise AnatomyError(
@@ -210,28 +200,27 @@ def from_image(drawing: Bool, *, pixel_mm: float) -> Centreline:
             expected="vessels longer than wide",
             remedy="Draw vessels as lines, or choose another picture",
         )
-    middle = np.column_stack((ij, np.ones(len(ij))))
-    nodes = _smoothed(grid.lps(middle), edges, walls)
-    return _proved(*_refined(nodes, edges), walls)
+    return _of_skeleton(grid.lps(np.column_stack((ij, np.ones(len(ij))))), edges, walls)
+
+
+def _of_skeleton(nodes: Float, edges: Int, walls: "_Walls") -> Centreline:
+    return _proved(*_refined(_smoothed(nodes, edges, walls), edges), walls)
 
 
 def _refined(nodes: Float, edges: Int) -> tuple[Float, Int]:
     """Divide edges evenly until none is longer than `LONGEST_EDGE_MM`."""
     begin, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
-    parts = np.maximum(np.ceil(np.linalg.norm(end - begin, axis=1) / LONGEST_EDGE_MM - 1e-9), 1).astype(
-        np.int64
-    )
-    which = np.repeat(np.arange(len(edges)), parts - 1)
-    number = np.arange(len(which)) - np.repeat(np.cumsum(parts - 1) - (parts - 1), parts - 1) + 1
-    share = (number / parts[which])[:, None]
+    count = np.ceil(np.linalg.norm(end - begin, axis=1) / LONGEST_EDGE_MM - 1e-9)
+    parts = np.maximum(count, 1).astype(np.int64)
+    which = np.repeat(np.arange(len(edges)), parts)
+    number = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts) + 1
+    # The node at the end of each part: that of the edge, or the next of those that are added.
+    inner = number < parts[which]
+    ends = np.where(inner, len(nodes) + np.cumsum(inner) - 1, edges[which, 1])
+    begins = np.where(number == 1, edges[which, 0], np.roll(ends, 1))
+    share, which = (number / parts[which])[inner, None], which[inner]
     added = begin[which] * (1.0 - share) + end[which] * share
-    base = len(nodes) + np.cumsum(parts - 1) - (parts - 1)
-    chains = []
-    for e, (a, b) in enumerate(edges):
-        middle = base[e] + np.arange(parts[e] - 1)
-        chain = np.concatenate(((a,), middle, (b,)))
-        chains.append(np.stack((chain[:-1], chain[1:]), axis=1))
-    return np.vstack((nodes, added)), np.concatenate(chains)
+    return np.vstack((nodes, added)), np.stack((begins, ends), axis=1)
 
 
 def _smoothed(nodes: Float, edges: Int, walls: "_Walls") -> Float:
@@ -246,8 +235,7 @@ def _smoothed(nodes: Float, edges: Int, walls: "_Walls") -> Float:
         np.add.at(total, edges[:, 0], current[edges[:, 1]])
         np.add.at(total, edges[:, 1], current[edges[:, 0]])
         wanted = np.where(free[:, None], 0.5 * (current + total / degree[:, None]), current)
-        good = walls.depth_mm(wanted) >= floor
-        current = np.where(good[:, None], wanted, current)
+        current = np.where((walls.depth_mm(wanted) >= floor)[:, None], wanted, current)
     return current
 
 
@@ -297,8 +285,7 @@ class _Walls:
         self._labels = np.asfortranarray(wall.astype(np.uint16))
         self._geometry = corner_geometry(grid, half_voxels)
         self._lost = float(np.linalg.norm(grid.spacing_mm)) + ROUNDING_MM + 1.0 / 256.0
-        # Below so many edges of a voxel the distance to the wall is searched exactly; the bound loses up to
-        # half.
+        # Below so many edges of a voxel the distance is searched exactly: the bound loses up to half.
         self._thin_mm = 6.0 * float(grid.spacing_mm.min())
         self._taken_off = 0.0 if half_voxels == SOLID else 0.5 * float(grid.spacing_mm.min())
 

@@ -57,8 +57,7 @@ class Curve:
     @property
     def breaks(self) -> Float:
         """Ends of the spans in the parameter, `(M + 1,)`."""
-        inner: Float = self.knots[DEGREE:-DEGREE]
-        return inner
+        return np.asarray(self.knots[DEGREE:-DEGREE])
 
     def at(self, parameters: ArrayLike) -> Float:
         """Return points and first and second derivatives, `(3, S, 3)`, at rising parameters `(S,)`."""
@@ -80,8 +79,8 @@ class Curve:
     def curvature_per_mm(self, parameters: ArrayLike) -> Float:
         """Return the curvature in 1/mm at rising parameters, `(S,)`: `|c' x c''| / |c'|^3`."""
         _point, first, second = self.at(parameters)
-        speed = np.linalg.norm(first, axis=1)
-        return np.asarray(np.linalg.norm(np.cross(first, second), axis=1) / speed**3)
+        bent = np.linalg.norm(np.cross(first, second), axis=1)
+        return np.asarray(bent / np.linalg.norm(first, axis=1) ** 3)
 
     def length_mm(self, per_span: int = 16) -> float:
         """Return the length, as the sum of `per_span` chords a span."""
@@ -99,8 +98,7 @@ def interpolate(points_mm: ArrayLike) -> Curve:
     from scipy.interpolate import make_interp_spline
 
     points = np.asarray(points_mm, dtype=np.float64)
-    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    points = points[np.concatenate(((True,), step > 1e-6))]
+    points = points[np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6)]
     if len(points) < 2:
         raise SettingsError(
             "A route needs two different points",

@@ -28,7 +28,9 @@ SMOOTH: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 2, 10),)
 SMOOTH_WITHIN: tuple[Stage, ...] = ((2.0, ANY_CURVATURE, 1, 8), (2.0, 1.0, 2, 10))
 FALLING: tuple[Stage, ...] = (
     (30.0, ANY_CURVATURE, 1, 8),
-    *((weight, 1.0, 1, 10) for weight in (30.0, 3.0, 0.3)),
+    (30.0, 1.0, 1, 10),
+    (3.0, 1.0, 1, 10),
+    (0.3, 1.0, 1, 10),
 )
 STIFF: tuple[Stage, ...] = ((30.0, ANY_CURVATURE, 4, STEPS), (30.0, 1.0, 4, STEPS))
 AS_IT_IS: tuple[Stage, ...] = ()
@@ -70,12 +72,7 @@ class Problem:
 
     def prove(self, curve: Curve) -> Proof:
         """Prove or disprove a curve."""
-        return prove(
-            curve,
-            self.centreline,
-            max_curvature_per_mm=self.limits.max_curvature_per_mm,
-            needed_mm=self.limits.needed_mm,
-        )
+        return prove(curve, self.centreline, self.limits.max_curvature_per_mm, self.limits.needed_mm)
 
 
 def repaired(
@@ -103,11 +100,9 @@ def repaired(
             0.02, bending / limit**2, times * limit, limits.needed_mm, spare_curvature,
             spare_mm, limits.end_tolerance_mm,
         ))  # fmt: skip
-        program = Program(
-            low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights, ends
-        )
+        task = Program(low, high, first, rows, samples, lumen.cones, *lumen.cells, guide.cones, weights, ends)
         # Violation that counts as none; the spares are larger, so that the limits themselves hold.
-        worst, _taken = repair(control, program, rounds, steps, 2e-3)
+        worst, _taken = repair(control, task, rounds, steps, 2e-3)
     return Curve(control_mm=control, knots=curve.knots), float(worst)
 
 
@@ -154,8 +149,7 @@ def _by_segments(
         return curve, proof
     # A segment is widened by at least so many spans on both sides: a bend needs length.
     margin = max(8, round(share * curve.n_spans))
-    ends_free = problem.limits.end_tolerance_mm > 0
-    parts = segments(proof, len(curve.control_mm), margin, ends_free=ends_free)
+    parts = segments(proof, len(curve.control_mm), margin, ends_free=problem.limits.end_tolerance_mm > 0)
     work = partial(_repaired_segment, curve, problem, start)
     done = map(work, parts) if executor is None or len(parts) < 2 else executor.map(work, parts)
     control = np.array(curve.control_mm)

@@ -55,8 +55,7 @@ class Segment:
         points_mm: (n, 3) float64.
         begin: Index of its first point on the path.
         held ((bool, bool)): Whether its first and last point join other parts of the path.
-        nodes_mm ((N, 3) float64): Nodes of the centreline around it; few, since a segment may be sent to
-            another process.
+        nodes_mm ((N, 3) float64): Nodes of the centreline around it; few, as it may be sent to a process.
         radius_mm: (N,) float64.
     """
 
@@ -160,8 +159,7 @@ class _Evaluator:
 
     def __init__(self, segment: Segment, limits: RouteLimits, near: "KDTree") -> None:
         self._segment, self._limits, self._near = segment, limits, near
-        step = np.linalg.norm(np.diff(segment.points_mm, axis=0), axis=1)
-        self._u = np.concatenate(((0.0,), np.cumsum(step)))
+        self._u = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(segment.points_mm, axis=0), axis=1)))
         _distance, nodes = near.query(segment.points_mm)
         # So much displacement takes every point to the wall.
         self._most = float((segment.radius_mm[nodes] ** 2).sum())
@@ -184,8 +182,7 @@ class _Evaluator:
         smoothing = float(genes[1]) ** 2 * self._most
         spline, _u = splprep(points.T, w=weight, u=self._u, s=smoothing, k=DEGREE, quiet=1)
         c, d1, d2 = (np.stack(splev(self._u, spline, der=d), axis=1) for d in range(3))
-        speed = np.maximum(np.linalg.norm(d1, axis=1), 1e-9)
-        return c, np.linalg.norm(np.cross(d1, d2), axis=1) / speed**3
+        return c, np.linalg.norm(np.cross(d1, d2), axis=1) / np.maximum(np.linalg.norm(d1, axis=1), 1e-9) ** 3
 
     def cost(self, genes: Float) -> float:
         """Return the cost of a chromosome, as in the module's first lines."""
@@ -195,8 +192,7 @@ class _Evaluator:
         limit = self._limits.max_curvature_per_mm
         length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
         chord = max(float(np.linalg.norm(points[-1] - points[0])), 1e-9)
-        cost = (
-            float((distance / np.maximum(radius, 1e-3)).mean() + (curvature / limit).mean()) + length / chord
-        )
+        means = (distance / np.maximum(radius, 1e-3)).mean() + (curvature / limit).mean()
+        cost = float(means) + length / chord
         cost += BROKEN * bool((curvature > limit).any())
         return cost + BROKEN * bool((distance > radius - self._limits.needed_mm).any())

@@ -26,8 +26,7 @@ class GuidePath:
     @property
     def along_mm(self) -> Float:
         """Length of the polyline up to each point, `(P,)`."""
-        step = np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)
-        return np.concatenate(((0.0,), np.cumsum(step)))
+        return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self.points_mm, axis=0), axis=1)))
 
     @property
     def cones(self) -> Float:
@@ -40,8 +39,7 @@ class GuidePath:
         along = self.along_mm
         if spacing_mm <= 0.0:
             return interpolate(self.points_mm)
-        count = max(round(along[-1] / spacing_mm), DEGREE)
-        at = np.linspace(0.0, along[-1], count + 1)
+        at = np.linspace(0.0, along[-1], max(round(along[-1] / spacing_mm), DEGREE) + 1)
         return interpolate(np.stack([np.interp(at, along, axis) for axis in self.points_mm.T], axis=1))
 
 
@@ -53,12 +51,10 @@ def guide_path_along(centreline: Centreline, nodes: Int, start_mm: Float, goal_m
     """
     inner = nodes[1:-1]
     points = np.vstack((start_mm, centreline.nodes_mm[inner], goal_mm))
-    radius = np.concatenate(
-        (centreline.radius_mm[nodes[:1]], centreline.radius_mm[inner], centreline.radius_mm[nodes[-1:]])
-    )
+    radius = centreline.radius_mm[np.concatenate((nodes[:1], inner, nodes[-1:]))]
     # Points nearer than this coincide: rounding, far below a voxel.
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6
-    kept = np.concatenate(((True,), apart))
+    kept = np.append(True, apart)
     if kept.sum() < 2:
         raise SettingsError(
             "Start and goal of the route are the same point",
@@ -102,9 +98,8 @@ def nearest_links(centreline: Centreline, neighbours: int = DEFAULT_NEIGHBOURS) 
     pairs = np.vstack((np.stack((a, b), axis=1)[open_between], centreline.edges, centreline.edges[:, ::-1]))
     pairs = np.unique(np.vstack((pairs, pairs[:, ::-1])), axis=0)
     gap = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
-    order = np.lexsort((gap, pairs[:, 0]))
-    start = np.searchsorted(pairs[order, 0], np.arange(n + 1))
-    return Links(start=read_only(start), nodes=read_only(np.ascontiguousarray(pairs[order, 1])))
+    sources, targets = pairs[np.lexsort((gap, pairs[:, 0]))].T.copy()
+    return Links(start=read_only(np.searchsorted(sources, np.arange(n + 1))), nodes=read_only(targets))
 
 
 def fewest_hops(links: Links, source: int, goal: int) -> Int:

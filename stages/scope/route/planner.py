@@ -8,14 +8,13 @@ from numpy.typing import ArrayLike
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Int
+from anatomy.base.typed import Int
 from anatomy.grid import read_only
 from stages.scope.route.centreline import Centreline
 from stages.scope.route.curve import Curve
 from stages.scope.route.exact import Problem, repair_exact
 from stages.scope.route.genetic import repair_genetic
 from stages.scope.route.guide_path import (
-    WAYPOINT_SPACING_MM,
     GuidePath,
     Links,
     NoRouteError,
@@ -102,8 +101,8 @@ def plan_route(
     links = nearest_links(centreline) if links is None else links
     nodes = fewest_hops(links, centreline.nearest_node(start), centreline.nearest_node(goal))
     guide = guide_path_along(centreline, nodes, start, goal)
-    tentative = guide.curve(WAYPOINT_SPACING_MM)
-    route = _route(centreline, nodes, guide, tentative, limits, repair, seed, executor)
+    problem = Problem(guide=guide, centreline=centreline, limits=limits)
+    route = _route(problem, nodes, repair, seed, executor)
     if require_proof:
         require_proved(route)
     return route
@@ -131,28 +130,21 @@ def require_proved(route: Route) -> None:
     )
 
 
-def _route(
-    centreline: Centreline,
-    nodes: Int,
-    guide: GuidePath,
-    tentative: Curve,
-    limits: RouteLimits,
-    repair: Repair,
-    seed: int,
-    executor: Executor | None,
-) -> Route:
-    problem = Problem(guide=guide, centreline=centreline, limits=limits)
+def _route(problem: Problem, nodes: Int, repair: Repair, seed: int, executor: Executor | None) -> Route:
+    limits, tentative = problem.limits, problem.guide.curve()
     curve, claimed = tentative, True
     if repair == "exact":
         curve, proof = repair_exact(tentative, problem, executor)
         claimed = proof.holds
     else:
         if repair == "ga":
-            curve, claimed = repair_genetic(tentative, centreline, limits, seed=seed, executor=executor)
+            curve, claimed = repair_genetic(
+                tentative, problem.centreline, limits, seed=seed, executor=executor
+            )
         proof = problem.prove(curve)
     return Route(
         nodes=read_only(nodes),
-        guide=guide,
+        guide=problem.guide,
         tentative=tentative,
         curve=curve,
         proof=proof,
@@ -170,11 +162,9 @@ class Replanner:
 
     def __init__(self, centreline: Centreline, route: Route) -> None:
         self._centreline, self._route = centreline, route
-        self._kept, self._edges = _corridor(centreline, route.nodes)
-        position = np.full(centreline.n_nodes, -1, dtype=np.int64)
-        position[self._kept] = np.arange(len(self._kept))
-        self._nodes = position[route.nodes]
-        self._edges = position[self._edges]
+        self._kept, edges = _corridor(centreline, route.nodes)
+        # All of these nodes are kept, and `_kept` is sorted: where one stands there is its new number.
+        self._nodes, self._edges = (np.searchsorted(self._kept, nodes) for nodes in (route.nodes, edges))
 
     def replan(self, nodes_mm: ArrayLike) -> Route:
         """Return the route for the centreline with all its nodes `(N, 3)` at new places, LPS mm.
@@ -190,21 +180,16 @@ class Replanner:
             raise SettingsError(
                 f"{moved.shape[0]} nodes were given for a centreline of {old.n_nodes}", expected="all nodes"
             )
-        radius = old.radius_mm[self._kept]
-        here = Centreline(nodes_mm=moved[self._kept], radius_mm=radius, edges=self._edges)
-        ends = [self._carried(end, moved) for end in (0, -1)]
-        limits = self._route.limits
+        kept, held, limits = self._kept, self._route.nodes[[0, -1]], self._route.limits
+        here = Centreline(nodes_mm=moved[kept], radius_mm=old.radius_mm[kept], edges=self._edges)
+        ends = self._route.guide.points_mm[[0, -1]] + moved[held] - old.nodes_mm[held]
         for point, name in zip(ends, ("start", "goal"), strict=True):
             here.require_inside(point, limits.needed_mm, name)
         guide = guide_path_along(here, self._nodes, *ends)
-        route = _route(here, self._nodes, guide, guide.curve(), limits, "exact", 0, None)
+        problem = Problem(guide=guide, centreline=here, limits=limits)
+        route = _route(problem, self._nodes, "exact", 0, None)
         require_proved(route)
         return route
-
-    def _carried(self, end: int, moved: Float) -> Float:
-        node = self._route.nodes[end]
-        point: Float = self._route.guide.points_mm[end] + moved[node] - self._centreline.nodes_mm[node]
-        return point
 
 
 def _corridor(centreline: Centreline, nodes: Int) -> tuple[Int, Int]:
@@ -216,5 +201,4 @@ def _corridor(centreline: Centreline, nodes: Int) -> tuple[Int, Int]:
     # A tube counts for replanning if it comes so near to one that the route runs through.
     near = distance <= radius + radius[nodes[nearest]] + 3.0
     near[nodes] = True
-    edges = centreline.edges[near[centreline.edges].all(axis=1)]
-    return np.flatnonzero(near), edges
+    return np.flatnonzero(near), centreline.edges[near[centreline.edges].all(axis=1)]

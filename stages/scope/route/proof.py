@@ -18,12 +18,8 @@ class RouteLimits:
     """What the device can follow, S of [Li2021] as curvature; a tolerance of 0 makes the ends exact."""
 
     max_curvature_per_mm: Annotated[float, quantity("largest curvature", above=0.0, at_most=10.0)]
-    device_radius_mm: Annotated[float, quantity("outer radius of the device", at_least=0.0, at_most=10.0)] = (
-        0.0
-    )
-    wall_margin_mm: Annotated[float, quantity("gap between device and wall", at_least=0.0, at_most=10.0)] = (
-        0.0
-    )
+    device_radius_mm: Annotated[float, quantity("radius of the device", at_least=0.0, at_most=10.0)] = 0.0
+    wall_margin_mm: Annotated[float, quantity("gap from device to wall", at_least=0.0, at_most=10.0)] = 0.0
     end_tolerance_mm: Annotated[
         float, quantity("distance of the ends from the wanted points", at_least=0.0, at_most=10.0)
     ] = 0.0
@@ -70,14 +66,11 @@ class Proof:
 
     def reasons(self) -> dict[str, int]:
         """Count the spans that are not proved by their reason."""
-        return {
-            text: int((self.verdicts == verdict).sum())
-            for verdict, text in REASONS.items()
-            if (self.verdicts == verdict).any()
-        }
+        found = np.bincount(self.verdicts, minlength=4).tolist()
+        return {text: found[verdict] for verdict, text in REASONS.items() if found[verdict]}
 
 
-def prove(curve: Curve, centreline: Centreline, *, max_curvature_per_mm: float, needed_mm: float) -> Proof:
+def prove(curve: Curve, centreline: Centreline, max_curvature_per_mm: float, needed_mm: float) -> Proof:
     """Prove, or disprove, that a curve keeps its curvature limit and is `needed_mm` deep in the lumen.
 
     Each span is a Bezier cubic, halved until bounds decide: the convex hull of the derivative's points bounds
@@ -120,9 +113,8 @@ def measure(curve: Curve, centreline: Centreline) -> RouteMetrics:
     points = curve.at(parameters)[0]
     curvature = curve.curvature_per_mm(parameters)
     wall = centreline.depth_mm(points)
-    chord = float(np.linalg.norm(points[-1] - points[0]))
     return RouteMetrics(
-        normalised_length=curve.length_mm(PER_SPAN) / chord,
+        normalised_length=curve.length_mm(PER_SPAN) / float(np.linalg.norm(points[-1] - points[0])),
         mean_curvature_per_mm=float(curvature.mean()),
         largest_curvature_per_mm=float(curvature.max()),
         mean_wall_mm=float(wall.mean()),

@@ -133,7 +133,7 @@ def best_of(table, count):
 
 
 @inner_kernel
-def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table, gradient, scratch, joints):
+def evaluate_candidates(lumen, scope, state, ahead, weights, offsets, table, gradient, scratch, joints):
     """Fill the table of all candidates (eq. 3) and return the best one, -1 if none is valid.
 
     `offsets` (121, 2) are shares, from -0.5 to 0.5, of the spacing of twist and bend.  A row beyond the
@@ -164,13 +164,11 @@ def evaluate_candidates(lumen, scope, state, look_ahead, weights, offsets, table
             table[n, BEND] = beta
             if inside:
                 evaluate_motion(
-                    lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
+                    lumen, scope, state, ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
                 )
     for n in range(CANDIDATES, table.shape[0]):
         alpha, beta = table[n, TWIST], table[n, BEND]
-        evaluate_motion(
-            lumen, scope, state, look_ahead, alpha, beta, voxel, gradient, table[n], scratch, joints
-        )
+        evaluate_motion(lumen, scope, state, ahead, alpha, beta, voxel, gradient, table[n], scratch, joints)
     fill_costs(scope, table, CANDIDATES, weights, state[12])
     return best_of(table, CANDIDATES)
 
@@ -186,9 +184,9 @@ def best_motion(lumen, scope, state, look_ahead, weights, offsets, table):
 
 
 @inner_kernel
-def take_sub_step(lumen, scope, state, look_ahead, step, row, looks, out, joints):
+def take_sub_step(lumen, scope, state, ahead, step, row, looks, out, joints):
     """Write the state `out` after a sub-step to a candidate; tell if all its `looks` poses are free."""
-    part = step / look_ahead
+    part = step / ahead
     alpha = state[12] + (row[TWIST] - state[12]) * part
     beta = state[13] + (row[BEND] - state[13]) * part
     kappa = circle_curvature(scope.link, scope.links, beta)
@@ -234,30 +232,28 @@ def compute_path(lumen, scope, weights, goal, steps, randomness, looks, states, 
             for n in range(CANDIDATES):
                 offsets[n, 0] = uniform(randomness) - 0.5
                 offsets[n, 1] = uniform(randomness) - 0.5
-        look_ahead = steps[0]
+        ahead = steps[0]
         if scope.radius > 0.0:
-            look_ahead = min(look_ahead, max(distance_to(lumen, goal, x, y, z), steps[2]))
+            ahead = min(ahead, max(distance_to(lumen, goal, x, y, z), steps[2]))
         moved = False
         while not moved:
             best = evaluate_candidates(
-                lumen, scope, state, look_ahead, weights, offsets, table, gradient, scratch, joints
+                lumen, scope, state, ahead, weights, offsets, table, gradient, scratch, joints
             )
-            step = min(steps[1], look_ahead)
+            step = min(steps[1], ahead)
             while best >= 0 and not moved:
-                if take_sub_step(
-                    lumen, scope, state, look_ahead, step, table[best], looks, states[count], joints
-                ):
+                if take_sub_step(lumen, scope, state, ahead, step, table[best], looks, states[count], joints):
                     moved = True
                 else:
                     table[best, VERDICT] = COLLIDES
                     best = best_of(table, CANDIDATES)
             if moved:
                 info[count, 0] = table[best, COST]
-                info[count, 1] = look_ahead
+                info[count, 1] = ahead
                 info[count, 2] = step
                 left -= step
-            elif look_ahead <= steps[2]:
+            elif ahead <= steps[2]:
                 return count, STUCK
             else:
-                look_ahead = max(0.5 * look_ahead, steps[2])
+                ahead = max(0.5 * ahead, steps[2])
         count += 1

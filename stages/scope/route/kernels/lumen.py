@@ -25,10 +25,8 @@ def cone_depth(cones, e, x, y, z):
     dx = cones[e, 4] - cones[e, 0]
     dy = cones[e, 5] - cones[e, 1]
     dz = cones[e, 6] - cones[e, 2]
-    r0 = cones[e, 3]
-    r1 = cones[e, 7]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    rise = r1 - r0
+    rise = cones[e, 7] - cones[e, 3]
     if length <= abs(rise):
         # One of the balls holds the other.
         share = 1.0 if rise > 0.0 else 0.0
@@ -42,7 +40,7 @@ def cone_depth(cones, e, x, y, z):
     cy = cones[e, 1] + share * dy
     cz = cones[e, 2] + share * dz
     distance = math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
-    return r0 + share * rise - distance, cx, cy, cz
+    return cones[e, 3] + share * rise - distance, cx, cy, cz
 
 
 @inner_kernel
@@ -64,11 +62,7 @@ def deep_enough(cones, index, cell_start, cell_cones, hint, enough, x, y, z):
     cell, the depth may be `NOWHERE`: it is exact where it is not negative, and never too large.  `hint` is a
     cone that is looked at first, -1 for none.
     """
-    best = NOWHERE
-    bx = 0.0
-    by = 0.0
-    bz = 0.0
-    cone = -1
+    best, bx, by, bz, cone = NOWHERE, 0.0, 0.0, 0.0, -1
     if hint >= 0:
         best, bx, by, bz = cone_depth(cones, hint, x, y, z)
         cone = hint
@@ -79,11 +73,7 @@ def deep_enough(cones, index, cell_start, cell_cones, hint, enough, x, y, z):
         for at in range(cell_start[cell], cell_start[cell + 1]):
             depth, cx, cy, cz = cone_depth(cones, cell_cones[at], x, y, z)
             if depth > best:
-                best = depth
-                bx = cx
-                by = cy
-                bz = cz
-                cone = cell_cones[at]
+                best, bx, by, bz, cone = depth, cx, cy, cz, cell_cones[at]
                 if best >= enough:
                     break
     return best, bx, by, bz, cone

@@ -97,8 +97,7 @@ def _depth_violation(program, s, v, multiplier, hints):
 
 @inner_kernel
 def _end_violation(program, control, end):
-    """Return the violation at an end, the vector from the wanted point, its length, and the control point, -1
-    if held."""
+    """Return the violation at an end, the vector from the wanted point, its length, the point (-1: held)."""
     a = 0 if end == 0 else control.shape[0] - 1
     if a < program.lo or a >= program.hi:
         return -1.0, 0.0, 0.0, 0.0, 0.0, -1
@@ -176,20 +175,16 @@ def lagrangian(program, control, multipliers, penalty, hints, violation, band, s
     for s in range(count):
         f, rows, sample = program.first[s], program.rows[s], program.samples[s]
         _sample_at(control, f, rows, v)
-        centring, bending = (
-            weights[CENTRING] * sample[0] / (sample[4] * sample[4]),
-            weights[BENDING] * sample[0],
-        )
+        centre = weights[CENTRING] * sample[0] / (sample[4] * sample[4])
+        bend = weights[BENDING] * sample[0]
         for axis in range(3):
             off = v[0, axis] - sample[1 + axis]
-            total += 0.5 * (centring * off * off + bending * v[2, axis] * v[2, axis])
+            total += 0.5 * (centre * off * off + bend * v[2, axis] * v[2, axis])
             for c in range(max(lo - f, 0), min(hi - f, 4)):
                 at = 3 * (f + c - lo) + axis
-                slope[at] += centring * rows[0, c] * off + bending * rows[2, c] * v[2, axis]
+                slope[at] += centre * rows[0, c] * off + bend * rows[2, c] * v[2, axis]
                 for e in range(max(lo - f, 0), c + 1):
-                    band[at, 3 * (c - e)] += (
-                        centring * rows[0, c] * rows[0, e] + bending * rows[2, c] * rows[2, e]
-                    )
+                    band[at, 3 * (c - e)] += centre * rows[0, c] * rows[0, e] + bend * rows[2, c] * rows[2, e]
         value, norm, nx, ny, nz, speed2, speed3 = _curvature_violation(v, weights)
         violation[s, 0] = value
         active = value + multipliers[s, 0] / penalty
@@ -281,7 +276,6 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
     damping = FIRST_DAMPING
     value = lagrangian(program, control, multipliers, penalty, hints, violation, band, slope)
     for taken in range(steps):
-        improved = False
         before = value
         # No step gains anything where the damping is larger: steps are then rounding.
         while damping < 1e10:
@@ -294,10 +288,9 @@ def _descend(program, control, multipliers, penalty, hints, violation, steps, wo
                 )
                 if new < value:
                     value = new
-                    improved = True
                     break
             damping *= RAISE
-        if not improved:
+        else:
             return taken + 1
         control[lo:hi] = trial[lo:hi]
         violation[:], band[:], slope[:] = trial_violation, trial_band, trial_slope
@@ -324,14 +317,11 @@ def repair(control, program, rounds, steps, tolerance):
         violation.copy(), np.zeros((n, BAND)), np.zeros(n),
     )  # fmt: skip
     hints = np.full(count, -1, dtype=np.int64)
-    penalty = FIRST_PENALTY
-    worst = math.inf
-    taken = 0
+    penalty, worst, taken = FIRST_PENALTY, math.inf, 0
     earlier = np.full(rounds, math.inf)
     for turn in range(rounds):
         taken += _descend(program, control, multipliers, penalty, hints, violation, steps, work)
-        previous = worst
-        worst = 0.0
+        previous, worst = worst, 0.0
         for s in range(count + 2):
             for kind in range(2):
                 worst = max(worst, violation[s, kind])

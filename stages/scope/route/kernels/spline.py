@@ -111,9 +111,7 @@ def _curvature_range(b):
             speed2 += speed * speed
             turn2 += n[i, axis] * n[i, axis]
         largest = max(largest, math.sqrt(turn2) / speed2**1.5 if speed2 > 0.0 else math.inf)
-    chord = np.zeros(3)
-    for axis in range(3):
-        chord[axis] = b[3, axis] - b[0, axis]
+    chord = b[3] - b[0]
     size = math.sqrt(chord[0] ** 2 + chord[1] ** 2 + chord[2] ** 2)
     slow = math.inf
     for i in range(3):
@@ -149,29 +147,16 @@ def prove_span(control, knots, first, cones, index, cell_start, cell_cones, limi
         middle = 0.125 * (piece[0] + 3.0 * piece[1] + 3.0 * piece[2] + piece[3])
         reach = 0.0
         for i in range(4):
-            reach = max(
-                reach,
-                (piece[i, 0] - middle[0]) ** 2
-                + (piece[i, 1] - middle[1]) ** 2
-                + (piece[i, 2] - middle[2]) ** 2,
-            )
+            dx, dy, dz = piece[i, 0] - middle[0], piece[i, 1] - middle[1], piece[i, 2] - middle[2]
+            reach = max(reach, dx**2 + dy**2 + dz**2)
         reach = math.sqrt(reach) * (1.0 + ROUNDING)
-        depth = depth_at(
-            cones,
-            index,
-            cell_start,
-            cell_cones,
-            middle[0] + origin[0],
-            middle[1] + origin[1],
-            middle[2] + origin[2],
-        )[0]
-        depth -= ROUNDING
+        x, y, z = middle[0] + origin[0], middle[1] + origin[1], middle[2] + origin[2]
+        depth = depth_at(cones, index, cell_start, cell_cones, x, y, z)[0] - ROUNDING
         if bend <= limit and depth - reach >= needed:
             bounds[0] = max(bounds[0], bend)
             bounds[1] = min(bounds[1], depth - reach)
             continue
-        for axis in range(3):
-            at_mm[axis] = middle[axis] + origin[axis]
+        at_mm[0], at_mm[1], at_mm[2] = x, y, z
         if curvature > limit:
             return BENDS
         if depth < needed:
@@ -179,20 +164,17 @@ def prove_span(control, knots, first, cones, index, cell_start, cell_cones, limi
         if level == DEEPEST:
             return UNDECIDED
         _halve(piece, stack[size + 1], stack[size])
-        depth_of[size] = level + 1
-        depth_of[size + 1] = level + 1
+        depth_of[size] = depth_of[size + 1] = level + 1
         size += 2
     return PROVED
 
 
 @kernel(nogil=True)
-def prove_spans(
-    control, knots, cones, index, cell_start, cell_cones, limit, needed, verdicts, points, bounds
-):
+def prove_spans(control, knots, cones, index, starts, cell_cones, limit, needed, verdicts, points, bounds):
     """Fill `verdicts` (M,) and `points` (M, 3) for all spans; update `bounds` as `prove_span` does."""
     for first in range(verdicts.shape[0]):
         verdicts[first] = prove_span(
-            control, knots, first, cones, index, cell_start, cell_cones, limit, needed, points[first], bounds
+            control, knots, first, cones, index, starts, cell_cones, limit, needed, points[first], bounds
         )
 
 
@@ -202,10 +184,8 @@ def basis_rows(knots, first, u, rows):
     k1, k2, k3 = knots[first + 1], knots[first + 2], knots[first + 3]
     k4, k5, k6 = knots[first + 4], knots[first + 5], knots[first + 6]
     for c in range(4):
-        d0 = 1.0 if c == 0 else 0.0
-        d1 = 1.0 if c == 1 else 0.0
-        d2 = 1.0 if c == 2 else 0.0
-        d3 = 1.0 if c == 3 else 0.0
+        d0, d1 = 1.0 if c == 0 else 0.0, 1.0 if c == 1 else 0.0
+        d2, d3 = 1.0 if c == 2 else 0.0, 1.0 if c == 3 else 0.0
         g0 = (d1 - d0) / (k4 - k1)
         g1 = (d2 - d1) / (k5 - k2)
         g2 = (d3 - d2) / (k6 - k3)
@@ -273,5 +253,4 @@ def take_samples(control, knots, begin, end, per_span, along, guide, first, rows
         high = near + 1
         while high < along.shape[0] - 1 and along[high] - u < GUIDED_MM:
             high += 1
-        samples[s, 5] = low
-        samples[s, 6] = high
+        samples[s, 5], samples[s, 6] = low, high

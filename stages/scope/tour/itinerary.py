@@ -19,8 +19,7 @@ class Itinerary:
         chosen: The exit of each lesion, an index into `subtree.exits`.
         order: Lesions in the order of visits.
         closed: Whether the tour returns to the root.
-        passes ((K,) int64): How often the stretch to each vertex is passed, in either direction: at most
-            twice.
+        passes ((K,) int64): How often the stretch to each vertex is passed, either way: at most twice.
         loops ((K,) int64): How many lesions lie beyond each stretch: what the paper's Table I counts.
         length_mm: Length of the tour.
         cost_mm: Length of the tour and the costs of its exits.
@@ -64,17 +63,12 @@ def plan_itinerary(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fa
     vertex = subtree.exit_vertex[list(chosen)]
     loops = np.zeros(subtree.n_vertices, dtype=np.int64)
     for v in vertex.tolist():
-        while v >= 0:
-            loops[v] += 1
-            v = int(subtree.parent[v])
+        loops[_to_root(subtree.parent, v)] += 1
     passes = np.where(loops > 0, 2, 0)
     passes[0] = 0
     last = int(np.argmax(subtree.depth_mm[vertex]))
     on_last = np.zeros(subtree.n_vertices, dtype=bool)
-    v = int(vertex[last])
-    while v >= 0:
-        on_last[v] = True
-        v = int(subtree.parent[v])
+    on_last[_to_root(subtree.parent, int(vertex[last]))] = True
     if not closed:
         passes[on_last & (passes > 0)] = 1
     length = float((passes * subtree.length_mm).sum())
@@ -98,20 +92,15 @@ def one_by_one_mm(subtree: Subtree, chosen: Sequence[int], *, closed: bool = Fal
 
 def _order(subtree: Subtree, vertex: Int, last: int, on_last: Bool) -> tuple[int, ...]:
     """Walk depth first and list the lesions as they are met; the last one last, also at its own vertex."""
-    lesions_at: dict[int, list[int]] = {}
-    for lesion, v in enumerate(vertex.tolist()):
-        lesions_at.setdefault(v, []).append(lesion)
+    # The first of the lesions beyond each vertex.
     first = np.full(subtree.n_vertices, len(vertex), dtype=np.int64)
-    for lesion, v in enumerate(vertex.tolist()):
-        while v >= 0:
-            first[v] = min(first[v], lesion)
-            v = int(subtree.parent[v])
+    for lesion in range(len(vertex) - 1, -1, -1):
+        first[_to_root(subtree.parent, int(vertex[lesion]))] = lesion
     order: list[int] = []
     stack = [0]
     while stack:
         v = stack.pop()
-        here = lesions_at.get(v, [])
-        order += sorted(here, key=lambda lesion: lesion == last)
+        order += sorted(np.flatnonzero(vertex == v).tolist(), key=lambda lesion: lesion == last)
         below = [int(c) for c in np.flatnonzero(subtree.parent == v) if first[c] < len(vertex)]
         stack += sorted(below, key=lambda c: (not on_last[c], -first[c]))
     return tuple(order)
@@ -120,14 +109,8 @@ def _order(subtree: Subtree, vertex: Int, last: int, on_last: Bool) -> tuple[int
 def _between(parent: Int, a: int, b: int) -> list[int]:
     """Return the vertices on the path from `a` to `b`, without `a`."""
     up_a, up_b = _to_root(parent, a), _to_root(parent, b)
-    common = set(up_b)
-    rise = []
-    for v in up_a:
-        rise.append(v)
-        if v in common:
-            break
-    fall = up_b[: up_b.index(rise[-1])]
-    return rise[1:] + fall[::-1]
+    shared = len(set(up_a) & set(up_b))
+    return up_a[1 : len(up_a) - shared + 1] + up_b[: len(up_b) - shared][::-1]
 
 
 def _to_root(parent: Int, v: int) -> list[int]:

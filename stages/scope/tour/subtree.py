@@ -81,54 +81,41 @@ def exits_of(
     distance = np.linalg.norm(offset, axis=1)
     nearest = int(np.argmin(distance))
     inside = distance[nearest] <= tree.radius_mm[nearest]
-    if inside:
-        points = np.array([nearest])
-    else:
-        # The sphere that first reaches a point; points met in the same step are equally far.
-        grown = np.ceil(distance / rule.step_mm) * rule.step_mm
-        points = np.flatnonzero(grown <= rule.reach_mm)
+    # The sphere that first reaches a point; points met in the same step are equally far.
+    grown = np.ceil(distance / rule.step_mm) * rule.step_mm
+    points = np.array([nearest]) if inside else np.flatnonzero(grown <= rule.reach_mm)
     if accepts is not None:
         points = np.array([point for point in points.tolist() if accepts(number, point)], dtype=np.int64)
     if not len(points):
+        why = "no point of the airway within reach is accepted"
+        if distance[nearest] > rule.reach_mm:
+            why = f"the nearest point of the airway is {distance[nearest]:.1f} mm away"
         raise TargetError(
-            f"The lesion at LPS ({', '.join(f'{x:.1f}' for x in lesion)}) has no exit: "
-            + (
-                f"the nearest point of the airway is {distance[nearest]:.1f} mm away"
-                if distance[nearest] > rule.reach_mm
-                else "no point of the airway within reach is accepted"
-            ),
+            f"The lesion at LPS ({', '.join(f'{x:.1f}' for x in lesion)}) has no exit: {why}",
             expected=f"a point of the airway within {rule.reach_mm:g} mm"
             + ("" if accepts is None else " that is accepted"),
             remedy="Leave the lesion out, or allow a longer reach",
         )
     line = offset[points] / np.maximum(distance[points], 1e-12)[:, None]
     angle = np.arccos(np.clip(np.einsum("ij,ij->i", line, tree.tangents[points]), -1.0, 1.0))
-    if inside:
-        return (_exit(number, points, distance, angle, np.zeros(1), 0, ("inside",)),)
     weight = rule.angle_weight
     weighted = (1.0 - weight) * distance[points] / rule.reach_mm + weight * angle / np.pi
     depth = tree.distance_from_root_mm[points]
-    best = {
-        "P1": int(np.lexsort((depth, angle))[0]),
-        "P2": int(np.lexsort((depth, grown[points]))[0]),
-        "P3": int(np.lexsort((depth, weighted))[0]),
-    }
+    sizes = {"inside": angle} if inside else {"P1": angle, "P2": grown[points], "P3": weighted}
     roles: dict[int, tuple[str, ...]] = {}
-    for role, at in best.items():
+    for role, size in sizes.items():
+        at = int(np.lexsort((depth, size))[0])
         roles[at] = (*roles.get(at, ()), role)
-    return tuple(_exit(number, points, distance, angle, weighted, at, names) for at, names in roles.items())
-
-
-def _exit(
-    lesion: int, points: Int, distance: Float, angle: Float, weighted: Float, at: int, roles: tuple[str, ...]
-) -> Exit:
-    return Exit(
-        lesion=lesion,
-        tree_point=int(points[at]),
-        roles=roles,
-        distance_mm=float(distance[points[at]]),
-        angle_rad=float(angle[at]),
-        weighted=float(weighted[at]),
+    return tuple(
+        Exit(
+            lesion=number,
+            tree_point=int(points[at]),
+            roles=names,
+            distance_mm=float(distance[points[at]]),
+            angle_rad=float(angle[at]),
+            weighted=0.0 if inside else float(weighted[at]),
+        )
+        for at, names in roles.items()
     )
 
 
@@ -154,8 +141,7 @@ class Subtree:
         side ((K,) int64): Of the stretch: 0 above the carina, 1 left, 2 right.
         exits: Ordered by lesion.
         exit_vertex: (X,) int64.
-        exit_resistance ((X,) float64): Of lesion and needle: eta inside the airway, eta and the weighted sum
-            outside.
+        exit_resistance ((X,) float64): Of lesion and needle: eta, and outside the airway the weighted sum.
         exit_cost_mm ((X,) float64): What taking this exit costs besides the length of the tour, as a length.
     """
 
@@ -216,12 +202,9 @@ def subtree_to(
     at = np.full(tree.n_points, -1, dtype=np.int64)
     at[vertices] = np.arange(len(vertices))
     parent, length, resistance = _stretches(tree, vertices, at, branch_resistances(tree, chosen))
-    inside = np.array([e.roles == ("inside",) for e in flat])
-    cost = (
-        np.zeros(len(flat))
-        if exit_cost_mm is None
-        else np.array([c for of_one in exit_cost_mm for c in of_one])
-    )
+    outside = np.array([0.0 if e.roles == ("inside",) else e.weighted for e in flat])
+    costs = [[0.0] * len(of_one) for of_one in exits] if exit_cost_mm is None else exit_cost_mm
+    cost = np.array([c for of_one in costs for c in of_one])
     if cost.shape != (len(flat),) or not (cost >= 0).all():
         raise SettingsError("The costs of the exits do not fit", expected="one number of at least 0 for each")
     return Subtree(
@@ -232,9 +215,7 @@ def subtree_to(
         side=read_only(_sides(tree)[tree.branch_of_point[vertices]]),
         exits=flat,
         exit_vertex=read_only(at[[e.tree_point for e in flat]]),
-        exit_resistance=read_only(
-            np.where(inside, chosen.eta, chosen.eta + np.array([e.weighted for e in flat]))
-        ),
+        exit_resistance=read_only(chosen.eta + outside),
         exit_cost_mm=read_only(np.asarray(cost, dtype=np.float64)),
     )
 
@@ -246,12 +227,8 @@ def _vertices(tree: AirwayTree, points: Int) -> Int:
         while point >= 0 and not used[point]:
             used[point] = True
             point = int(tree.parent_point[point])
-    below = np.zeros(tree.n_points, dtype=np.int64)
-    child = np.flatnonzero(used[1:]) + 1
-    np.add.at(below, tree.parent_point[child], 1)
-    kept = used & (below > 1)
-    kept[points] = True
-    kept[0] = True
+    kept = used & (np.bincount(tree.parent_point[1:][used[1:]], minlength=tree.n_points) > 1)
+    kept[points] = kept[0] = True
     kept[tree.carina_point] |= bool(used[tree.carina_point])
     return np.flatnonzero(kept)
 
@@ -261,16 +238,12 @@ def _stretches(tree: AirwayTree, vertices: Int, at: Int, z: Float) -> tuple[Int,
     per_mm = z / np.maximum(tree.branch_length_mm, 1e-9)
     parent = np.full(len(vertices), -1, dtype=np.int64)
     length, resistance = np.zeros(len(vertices)), np.zeros(len(vertices))
-    for v, point in enumerate(vertices.tolist()):
-        here = point
-        while (above := int(tree.parent_point[here])) >= 0:
+    for v, here in enumerate(vertices.tolist()):
+        while parent[v] < 0 and (above := int(tree.parent_point[here])) >= 0:
             step = float(tree.distance_from_root_mm[here] - tree.distance_from_root_mm[above])
             length[v] += step
             resistance[v] += step * float(per_mm[tree.branch_of_point[here]])
-            here = above
-            if at[here] >= 0:
-                parent[v] = at[here]
-                break
+            here, parent[v] = above, at[above]
     return parent, length, resistance
 
 
@@ -322,11 +295,7 @@ def branch_resistances(tree: AirwayTree, weights: Resistances) -> Float:
     angle[0] = 0.0
     diameter = 2.0 * np.maximum(tree.branch_mean_radius_mm, 1e-3)
     cartilage = tree.generation <= weights.cartilage_generations
-    z = (
-        weights.alpha * tree.branch_length_mm / diameter
-        + weights.beta * angle
-        + weights.gamma * cartilage.astype(np.float64)
-    )
+    z = weights.alpha * tree.branch_length_mm / diameter + weights.beta * angle + weights.gamma * cartilage
     return read_only(np.asarray(z, dtype=np.float64))
 
 
@@ -371,13 +340,8 @@ class Circuits:
 
     def choice(self, reading: Reading = "printed") -> tuple[int, ...]:
         """Return the exits, one a lesion, of the circuit with the least resistance; the first of equals."""
-        number = int(np.argmin(self.values(reading)))
-        chosen = []
-        for m in range(len(self.first) - 2, -1, -1):
-            size = int(self.first[m + 1] - self.first[m])
-            chosen.append(int(self.first[m]) + number % size)
-            number //= size
-        return tuple(chosen[::-1])
+        places = np.unravel_index(np.argmin(self.values(reading)), np.diff(self.first))
+        return tuple((self.first[:-1] + places).tolist())
 
 
 def combinations(subtree: Subtree) -> int:

@@ -44,15 +44,11 @@ def _reduced(parent, resistance, vertex_of, lesion, below):
 def _sort_two(keys, values, n):
     """Sort the first `n` of two arrays by ascending key, keeping the order of equal ones."""
     for i in range(1, n):
-        key = keys[i]
-        value = values[i]
-        j = i - 1
+        key, value, j = keys[i], values[i], i - 1
         while j >= 0 and keys[j] > key:
-            keys[j + 1] = keys[j]
-            values[j + 1] = values[j]
+            keys[j + 1], values[j + 1] = keys[j], values[j]
             j -= 1
-        keys[j + 1] = key
-        values[j + 1] = value
+        keys[j + 1], values[j + 1] = key, value
 
 
 @inner_kernel
@@ -114,15 +110,11 @@ def all_resistances(parent, resistance, side, exit_vertex, exit_resistance, firs
     lesion fastest.
     """
     lesions = first.shape[0] - 1
-    vertex_of = np.zeros(lesions, dtype=np.int64)
-    lesion = np.zeros(lesions)
+    vertex_of, lesion = np.zeros(lesions, dtype=np.int64), np.zeros(lesions)
     n = parent.shape[0]
-    count = np.zeros(n, dtype=np.int64)
-    below = np.zeros(n)
-    on_n = np.zeros(n + 1, dtype=np.int64)
-    on_r = np.zeros(n + 1)
-    par_n = np.zeros(lesions + 1, dtype=np.int64)
-    par_r = np.zeros(lesions + 1)
+    count, below = np.zeros(n, dtype=np.int64), np.zeros(n)
+    on_n, on_r = np.zeros(n + 1, dtype=np.int64), np.zeros(n + 1)
+    par_n, par_r = np.zeros(lesions + 1, dtype=np.int64), np.zeros(lesions + 1)
     group = np.zeros(lesions + 1, dtype=np.int64)
     for c in range(printed.shape[0]):
         rest = c

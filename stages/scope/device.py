@@ -55,11 +55,8 @@ class Bronchoscope:
             allowed = f"less than bending_length_mm = {self.bending_length_mm:g}, of which it is a part"
             raise impossible("rigid_head_mm", self.rigid_head_mm, allowed)
         if self.channel_diameter_mm >= self.outer_diameter_mm:
-            raise impossible(
-                "channel_diameter_mm",
-                self.channel_diameter_mm,
-                f"less than outer_diameter_mm = {self.outer_diameter_mm:g}",
-            )
+            allowed = f"less than outer_diameter_mm = {self.outer_diameter_mm:g}"
+            raise impossible("channel_diameter_mm", self.channel_diameter_mm, allowed)
         for name in ("min_bending_radius_mm", "min_shaft_radius_mm"):
             if getattr(self, name) <= self.radius_mm:
                 wide = f"more than half of outer_diameter_mm, {self.radius_mm:g}: no scope bends into itself"

@@ -65,15 +65,14 @@ class Growth:
     def __init__(self, walls: Walls, tree: AirwayTree, tried: Bool, passable: Bool, device: Device) -> None:
         self._walls, self._tree, self._device = walls, tree, device
         self._tried, self._passable = tried, passable
-        # Directions of a ring: 45 degrees apart.
-        # Curvatures beside that which leads to the route ahead: at a tip of 15 mm they move it by 0.3 to 3
-        # mm.
+        # Curvatures beside that which leads to the route ahead: they move a tip of 15 mm by 0.3 to 3 mm.
         self._offsets = np.vstack([np.zeros((1, 2)), rings((0.003, 0.01, 0.03), 8)])
-        self._rows: list[Float] = []
-        self._parents: list[Int] = []
-        self._straight: list[Bool] = []
-        self._advance: list[float] = []
-        self._count = 0
+        # The first layer has no states, so that there is always one.
+        self._rows = [np.zeros((0, kernel.COLUMNS))]
+        self._parents = [np.zeros(0, dtype=np.int64)]
+        self._straight = [np.zeros(0, dtype=np.bool_)]
+        self._advance = [0.0]
+        self._begins = [0, 0]
         self._layers: dict[int, list[tuple[int, float]]] = {}
         """Of each branch: number of a layer and how far from the root its tips are, in the median."""
 
@@ -108,8 +107,7 @@ class Growth:
         return self._layers[branch][-1][1] if self._layers.get(branch) else 0.0
 
     def _ends_before(self, branch: int) -> bool:
-        """Tell whether the parent's states end before its fork, up to where both routes and searches are the
-        same."""
+        """Tell whether the parent's states end before its fork: up to there both searches are the same."""
         if branch == 0:
             return False
         fork = int(self._tree.parent_point[self._tree.branch_start[branch]])
@@ -127,8 +125,7 @@ class Growth:
         from_root = self._tree.distance_from_root_mm[points]
         states = self._rows[start[0]].copy()
         numbers = self._number(start[0])
-        begin = int(self._tree.branch_start[branch])
-        shared = int(np.searchsorted(points, begin)) if branch else len(points)
+        shared = int(np.searchsorted(points, self._tree.branch_start[branch])) if branch else len(points)
         states[:, kernel.NEAR] = np.minimum(states[:, kernel.NEAR], max(shared - 1, 0))
         end = len(points) - 1
         while True:
@@ -166,16 +163,15 @@ class Growth:
         """Put a straight section into the trachea, where the first one fits."""
         from anatomy import poses
 
-        length = self._device.length
         along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route.points, axis=0), axis=1)))
         # The first straight section may begin so far down the trachea.
         for n in range(int(np.searchsorted(along, 30.0))):
-            tip = int(np.searchsorted(along, along[n] + length))
+            tip = int(np.searchsorted(along, along[n] + self._device.length))
             if tip >= len(along):
                 return False
             frame = poses.pose(route.points[n], route.points[tip] - route.points[n])
             state = np.zeros((1, kernel.COLUMNS))
-            state[0, : kernel.U] = np.concatenate([frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3]])
+            state[0, : kernel.U] = frame[:3].T.ravel()
             state[0, kernel.NEAR] = tip
             if kernel.put_first(self._walls, self._device, route, state[0]):
                 layer = self._add(state, np.array([-1]), np.array([False]), -STEP_MM)
@@ -192,8 +188,7 @@ class Growth:
         chords = places[ahead] - places[behind]
         lengths = np.linalg.norm(chords, axis=1, keepdims=True)
         tangents = np.where(lengths > 0.0, chords / np.maximum(lengths, 1e-9), tree.tangents[points])
-        # The room beside the axis counts at least so much, half a voxel: costs stay finite where it is
-        # narrow.
+        # The room beside the axis counts at least so much, half a voxel: costs stay finite in narrow places.
         room = np.maximum(tree.radius_mm[points] - self._device.radius, 0.3)
         return Route(points=places, tangents=tangents, room=room)
 
@@ -202,38 +197,24 @@ class Growth:
         self._parents.append(np.asarray(parents, dtype=np.int64))
         self._straight.append(straight)
         self._advance.append(advance_mm + STEP_MM)
-        self._count += len(states)
+        self._begins.append(self._begins[-1] + len(states))
         return len(self._rows) - 1
 
     def _number(self, layer: int) -> Int:
-        """Return the numbers of the states of a layer; the last one was added just now."""
-        if layer == len(self._rows) - 1:
-            return np.arange(self._count - len(self._rows[layer]), self._count)
-        begin = sum(len(rows) for rows in self._rows[:layer])
-        return np.arange(begin, begin + len(self._rows[layer]))
+        """Return the numbers of the states of a layer."""
+        return np.arange(self._begins[layer], self._begins[layer + 1])
 
     def _result(self) -> StateTree:
-        if not self._rows:
-            empty = np.zeros(0)
-            return StateTree(
-                states=np.zeros((0, kernel.COLUMNS)),
-                parent=empty.astype(np.int64),
-                by_straight=empty.astype(bool),
-                advance_mm=empty,
-                turned_from=empty.astype(np.int64),
-            )
-        begins = np.append(0, np.cumsum([len(rows) for rows in self._rows]))
         used = sorted({layer for layers in self._layers.values() for layer, _ in layers})
-        ends = [len(self._rows[layer]) - 1 for layer in used]
         # States of a layer from which tips are turned, spread over those that it keeps, the best among them.
-        spread = [np.unique(np.linspace(0, end, 16).astype(np.int64)) for end in ends]
-        some = [begins[layer] + members for layer, members in zip(used, spread, strict=True)]
+        numbers = [self._number(layer) for layer in used]
+        some = [each[np.unique(np.linspace(0, len(each) - 1, 16).astype(np.int64))] for each in numbers]
         return StateTree(
             states=np.concatenate(self._rows),
             parent=np.concatenate(self._parents),
             by_straight=np.concatenate(self._straight),
-            advance_mm=np.repeat(self._advance, [len(rows) for rows in self._rows]),
-            turned_from=np.concatenate(some),
+            advance_mm=np.repeat(self._advance, np.diff(self._begins)),
+            turned_from=np.concatenate([self._number(0), *some]),
         )
 
 

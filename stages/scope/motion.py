@@ -13,7 +13,7 @@ import numpy as np
 
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
-from anatomy.grid import read_only
+from anatomy.grid import freeze_arrays, read_only
 from anatomy.poses import poses_on_arc, poses_on_pieces
 from stages.scope.device import laid_pieces
 
@@ -39,8 +39,7 @@ class ScopeMotion:
     bending_length_mm: float
 
     def __post_init__(self) -> None:
-        for name in ("lps_from_entry", "states"):
-            object.__setattr__(self, name, read_only(np.array(getattr(self, name), dtype=np.float64)))
+        freeze_arrays(self, "lps_from_entry", "states", dtype=np.float64)
 
     @property
     def pieces(self) -> Float:

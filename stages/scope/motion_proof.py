@@ -1,6 +1,7 @@
 """The proof of one motion of a bronchoscope: limits, room in and between states; and proved tips along it."""
 
 import math
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -68,30 +69,25 @@ class MotionProver:
         wrong = broken_limit(self._scope, motion)
         if wrong:
             return wrong
-        entry = frame_columns(motion.lps_from_entry)
+        device, entry = self._device, frame_columns(motion.lps_from_entry)
         where = np.zeros(1, dtype=np.int64)
         room = motion_room(
-            self._walls, self._scope.radius_mm + self._scope.lumen_margin_mm, self._scope.bending_length_mm,
-            entry, motion.states, turn_mm, step_mm, where,
-        )  # fmt: skip
+            self._walls, device.radius, device.length, entry, motion.states, turn_mm, step_mm, where
+        )
         if room < 0.0:
             return f"the scope is not proved to be free of the wall from state {int(where[0])} on"
         return float(room)
 
     def tolerances(self, motion: ScopeMotion) -> Float:
-        """Return by how much advance in mm, twist and bend in rad may err in each step `(M - 1, 3)` of a
-        proved motion.
+        """Return by how much advance in mm, twist and bend in rad may err in each step, `(M - 1, 3)`.
 
         If one of the three errs by no more than this anywhere in a step of a proved motion, and all else is
         as stated, the scope with its gap stays in the lumen during it.  Larger values may be possible,
         smaller ones are.
         """
         out = np.zeros((len(motion.states) - 1, 3))
-        section_mm = self._scope.bending_length_mm
-        entry = frame_columns(motion.lps_from_entry)
-        step_tolerances(
-            self._walls, self._device.radius, section_mm, entry, motion.states, PROOF_TURN_MM, out
-        )
+        device, entry = self._device, frame_columns(motion.lps_from_entry)
+        step_tolerances(self._walls, device.radius, device.length, entry, motion.states, PROOF_TURN_MM, out)
         return out
 
     def simplest(
@@ -109,7 +105,7 @@ class MotionProver:
         tightest = max_curvature_per_mm * device.length
         ends = max(end_bends_rad[0], -tightest), min(end_bends_rad[1], tightest)
         least = min(KEPT_ROOM * room, SIMPLER_ROOM_MM)
-        found = Simplifier(self._walls, device, motion, end_bends_rad=ends, least_mm=least).best()
+        found = Simplifier(self._walls, device, motion, ends, least).best()
         return motion if isinstance(self.prove(found), str) else found
 
     def row(self, motion: ScopeMotion, shifts_mm: ArrayLike) -> "TipRow":
@@ -120,12 +116,9 @@ class MotionProver:
         """
         shifts = np.ascontiguousarray(np.atleast_1d(np.asarray(shifts_mm, dtype=np.float64)))
         tips, rooms = np.zeros((len(shifts), 9)), np.zeros(len(shifts))
-        shifted_tips(
-            self._walls, self._device, frame_columns(motion.lps_from_entry), motion.states, shifts, tips,
-            rooms,
-        )  # fmt: skip
-        _nearest, inside = in_tip_region(self._tree, tips)
-        proved = (rooms >= 0.0) & inside
+        entry = frame_columns(motion.lps_from_entry)
+        shifted_tips(self._walls, self._device, entry, motion.states, shifts, tips, rooms)
+        proved = (rooms >= 0.0) & in_tip_region(self._tree, tips)[1]
         return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))
 
 
@@ -217,8 +210,7 @@ class TipRow:
 
     Args:
         motion: That of the tip at shift 0.
-        shifts_mm ((K,) float64): How much farther the base of the bending section stops, negative for less
-            far.
+        shifts_mm ((K,) float64): How much farther the bending section's base stops, negative for less far.
         tips ((K, 9) float64): Point, direction, and +x of the working channel's frame, LPS mm.
         proved ((K,) bool): Whether the motion to the tip is proved, and the tip where tips of plans may be.
     """
@@ -238,24 +230,16 @@ def shifted(motion: ScopeMotion, shift_mm: float) -> ScopeMotion:
     states = motion.states
     stop = float(states[-1, ADVANCE]) + shift_mm
     slides = np.flatnonzero(np.diff(states[:, ADVANCE]) > SHORTEST_MM)
-    if shift_mm == 0.0 or not len(slides):
-        return motion
     held = slides[states[slides, ADVANCE] <= stop]
-    if not len(held):
+    if shift_mm == 0.0 or not len(held):
         return motion
-    last = int(held[-1])
-    rows = [tuple(row) for row in states[: last + 1].tolist()]
+    rows = [tuple(row) for row in states[: held[-1] + 1].tolist()]
     slide(rows, stop)
     _, twist, bend = rows[-1]
     to_twist, to_bend = states[-1, 1:].tolist()
-    most = max(abs(bend), abs(to_bend))
-    direct = math.hypot(to_bend - bend, most * (to_twist - twist))
+    direct = math.hypot(to_bend - bend, max(abs(bend), abs(to_bend)) * (to_twist - twist))
     turn(rows, to_twist, to_bend, direct > abs(bend) + abs(to_bend))
-    return ScopeMotion(
-        lps_from_entry=motion.lps_from_entry,
-        states=np.array(rows),
-        bending_length_mm=motion.bending_length_mm,
-    )
+    return replace(motion, states=np.array(rows))
 
 
 def evenly(step_mm: float, reach_mm: float) -> Float:

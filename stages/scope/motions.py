@@ -65,19 +65,17 @@ def find_passages(lung: Lung, scope: Bronchoscope, *, reach_mm: float) -> Passag
     narrowest = _narrowest_on_the_route(lung)
     passable = narrowest >= needed
     ahead = _distance_to_exit(tree, _in_lung_tissue(lung)) <= reach_mm
-    widest = float(narrowest[ahead].max(initial=0.0))
     return Passages(
         lumen_radius_mm=narrowest,
         passable=passable,
         exits_ahead=ahead,
-        narrowest=_where_too_narrow(tree, passable, narrowest, needed),
-        widest_scope_mm=max(2.0 * (widest - scope.lumen_margin_mm), 0.0),
+        narrowest=_where_too_narrow(tree, passable, needed - narrowest),
+        widest_scope_mm=max(2.0 * (float(narrowest[ahead].max(initial=0.0)) - scope.lumen_margin_mm), 0.0),
     )
 
 
 def _narrowest_on_the_route(lung: Lung) -> Float:
-    """Return the proved lumen radius of the narrowest place from the root to each point; depth is
-    1-Lipschitz."""
+    """Return the proved lumen radius of the narrowest place up to each point; the depth is 1-Lipschitz."""
     tree = lung.tree
     parent = np.maximum(tree.parent_point, 0)
     step = tree.points_lps - tree.points_lps[parent]
@@ -99,15 +97,13 @@ PROBE_DIRECTIONS = 8
 def _in_lung_tissue(lung: Lung) -> Bool:
     """Tell at which tree points free lung tissue lies beside the airway, in some direction."""
     tree = lung.tree
-    helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
-    first = np.cross(tree.tangents, helper)
+    first = np.cross(tree.tangents, np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(tree.tangents, first)
     nowhere = np.ones(tree.n_points, dtype=bool)
     for phi in np.arange(PROBE_DIRECTIONS) * (2 * math.pi / PROBE_DIRECTIONS):
         direction = math.cos(phi) * first + math.sin(phi) * second
-        # Tissue is looked for so far beyond the lumen's radius: beyond the walls of the airways that tubes
-        # leave.
+        # Tissue is looked for so far beyond the lumen: beyond the walls of the airways that tubes leave.
         probe = tree.points_lps + (tree.radius_mm + 2.5)[:, None] * direction
         nowhere &= (_labels_at(lung, probe) & (OUTSIDE | AIRWAY)) != 0
     return ~nowhere
@@ -131,17 +127,14 @@ def _distance_to_exit(tree: AirwayTree, in_tissue: Bool) -> Float:
     return distance_mm
 
 
-def _where_too_narrow(
-    tree: AirwayTree, passable: Bool, radius_mm: Float, needed_mm: float
-) -> tuple[int, float]:
+def _where_too_narrow(tree: AirwayTree, passable: Bool, shortfall_mm: Float) -> tuple[int, float]:
     """Say at which generation most routes end, and by how much (median)."""
     ends = np.flatnonzero(~passable[1:] & passable[tree.parent_point[1:]]) + 1
     if not len(ends):
-        return (-1, 0.0) if passable[0] else (0, float(needed_mm - radius_mm[0]))
+        return (-1, 0.0) if passable[0] else (0, float(shortfall_mm[0]))
     generation = tree.generation[tree.branch_of_point[ends]]
     worst = int(np.argmax(np.bincount(generation)))
-    shortfall = needed_mm - radius_mm[ends[generation == worst]]
-    return worst, float(np.median(shortfall))
+    return worst, float(np.median(shortfall_mm[ends[generation == worst]]))
 
 
 @frozen_record
@@ -233,9 +226,7 @@ class ScopeMotions:
             )
         away = np.linalg.norm(self.tips[:, :3] - np.asarray(point_lps, dtype=np.float64), axis=1)
         direction = np.asarray(forward, dtype=np.float64)
-        cosine = self.tips[:, 3:6] @ (direction / np.linalg.norm(direction))
-        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        # Ten degrees count as much as a mm.
+        angle = np.arccos(np.clip(self.tips[:, 3:6] @ (direction / np.linalg.norm(direction)), -1.0, 1.0))
         return int(np.argmin(np.hypot(away, angle / math.radians(10.0))))
 
 
@@ -255,23 +246,17 @@ def find_motions(
     along a branch are `spacing_mm` apart; those turned aside are twice as far apart.
     """
     passages = find_passages(lung, scope, reach_mm=reach_mm)
-    walls, device = walls_of(lung), kernel_device(scope, max_curvature_per_mm)
-    # Tell which tree points are not too narrow on the way to them, nor would be a little beside the axis.
-    tree = lung.tree
-    # The lumen may be wider by so much, half a voxel or more, beside the axis than on it.
+    tree, walls, device = lung.tree, walls_of(lung), kernel_device(scope, max_curvature_per_mm)
+    # Points are tried that are wide enough on the way to them; beside the axis the lumen may be wider by so
+    # much than on it, half a voxel or more.
     tried = tree.radius_mm >= device.radius - 0.5
     for point in range(1, tree.n_points):
         tried[point] &= tried[tree.parent_point[point]]
-    states = Growth(walls, lung.tree, tried, passages.passable, device).grow()
+    states = Growth(walls, tree, tried, passages.passable, device).grow()
     least, most = tip_bends_rad or scope.bends_rad
+    device = device._replace(least_bend=least, most_bend=most)
     tips, tree_point, ahead = find_tips(
-        walls,
-        lung.tree,
-        passages.exits_ahead,
-        states,
-        device._replace(least_bend=least, most_bend=most),
-        max_curvature_per_mm=max_curvature_per_mm,
-        spacing_mm=spacing_mm,
+        walls, tree, passages.exits_ahead, states, device, max_curvature_per_mm, spacing_mm
     )
     kept, number = states.only(tips[:, turning.SOURCE].astype(np.int64))
     entry = np.eye(4)
@@ -305,7 +290,6 @@ def find_tips(
     wanted: Bool,
     states: StateTree,
     device: Device,
-    *,
     max_curvature_per_mm: float,
     spacing_mm: float,
 ) -> tuple[Float, Int, int]:
@@ -334,12 +318,10 @@ def find_tips(
 def _places(tree: AirwayTree, wanted: Bool, spacing_mm: float) -> tuple[Places, int, int]:
     """Return where tips may be, how many groups there are of tips that look ahead, and how many in all."""
     ahead = _slots(tree, spacing_mm)
-    # Turned tips are so much farther apart: each place has many directions, and nearer ones give about the
-    # same poses.
+    # Turned tips are so much farther apart: a place has many directions, nearer ones give about the same.
     aside = _slots(tree, 2.0 * spacing_mm)
     groups = int(ahead.max()) + 1
-    helper = np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)]
-    first = np.cross(tree.tangents, helper)
+    first = np.cross(tree.tangents, np.eye(3)[np.argmin(np.abs(tree.tangents), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     low, size = tree.points_lps.min(axis=0), MAX_OFF_AXIS_MM * (1.0 - ROUNDING)
     begins, order = _cells(np.floor((tree.points_lps - low) / size).astype(np.int64))

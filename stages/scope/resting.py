@@ -71,8 +71,7 @@ class RestingShape:
             `stages.scope.kernels.body`.
         lengths_mm: (N,) float64.
         curvature ((N, 2) float64): Of each arc in its Bishop frame, 1/mm.
-        force_n, give_mm ((N,) float64): How the wall presses at the end of each arc, and how far it yields
-            there.
+        force_n, give_mm ((N,) float64): How the wall presses at the end of each arc, and how far it yields.
         farther_mm: How much farther than planned the shaft is advanced at the entry.
         settled: Whether it is at rest: no step lowers the energy any more, and the tip has its depth.
     """
@@ -183,28 +182,19 @@ class RestingShaft:
         )
 
     def _followed(
-        self,
-        motion: ScopeMotion,
-        shaft: kernel.Shaft,
-        entry: Float,
-        curvature: Float,
-        pull: Float,
-        laid: Float,
+        self, motion: ScopeMotion, shaft: kernel.Shaft, entry: Float, bends: Float, pull: Float, laid: Float
     ) -> float:
-        """Return how far the hand follows while the shaft, too long as laid, settles until nothing needs to
-        hold the tip."""
-        # How stiffly the tip is held at its depth while the shaft settles at first, lest it leaves its
-        # branch.
+        """Return how far the hand follows until nothing holds the tip of a shaft that is too long as laid."""
+        # The tip is held so stiffly at its depth while the shaft settles at first, lest it leaves its branch.
         held = shaft._replace(hold=1.0)
         farther, before, slope = 0.0, (0.0, 0.0), 0.0
         for count in range(ROUNDS):
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             drawn = _drawn_back(held, farther)
             # While the tip is held, a step is worth at least this.
-            kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, 1e-4, MOST_STEPS)
+            kernel.bring_to_rest(self._lumen, drawn, entry, bends, pull, laid, 1e-4, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
-            # The hand has followed where the tip, let go, moves the spring by less than this: a force of 0.01
-            # N.
+            # The hand has followed where the tip moves the spring by less than this: a force of 0.01 N.
             if abs(beyond) < 0.01:
                 break
             if count and abs(farther - before[0]) > 1e-6:
@@ -235,17 +225,13 @@ class RestingShaft:
         stiff = chosen.wall_stiffer * self._contact.wall_stiffness_n_per_mm2
         wall = stiff * 0.5 * (length + np.append(length[1:], 0.0))
         yields, radius = self._contact.max_wall_give_mm, self._scope.radius_mm
-        tip = motion.lps_from_tip
-        shaft = kernel.Shaft(
-            length, stiffness, rest, wall, yields, radius, tip[:3, 3].copy(), tip[:3, 2].copy(), 0.0
-        )
-        return shaft, laid
+        ahead, tip = motion.lps_from_tip[:3, 2:].T.copy()
+        return kernel.Shaft(length, stiffness, rest, wall, yields, radius, tip, ahead, 0.0), laid
 
 
 def _drawn_back(shaft: kernel.Shaft, farther_mm: float) -> kernel.Shaft:
     """Return a shaft that touches no wall behind the planned entry, where the image may end."""
-    behind = np.cumsum(shaft.length) + farther_mm < 0.0
-    return shaft._replace(wall=np.where(behind, 0.0, shaft.wall))
+    return shaft._replace(wall=np.where(np.cumsum(shaft.length) + farther_mm < 0.0, 0.0, shaft.wall))
 
 
 def _laid(motion: ScopeMotion, length: Float) -> Float:
@@ -317,12 +303,10 @@ class WallContact:
     max_friction: Annotated[
         float, quantity("largest coefficient of friction on the wall", at_least=0.0, at_most=2.0)
     ] = 0.2
-    max_wall_force_n: Annotated[
-        float, quantity("largest force on 10 mm of wall", above=0.0, at_most=100.0)
-    ] = 1.0
-    max_wall_give_mm: Annotated[
-        float, quantity("how far the wall may be pressed in", above=0.0, at_most=10.0)
-    ] = 1.0
+    max_wall_force_n: Annotated[float, quantity("most force on 10 mm of wall", above=0.0, at_most=100.0)] = (
+        1.0
+    )
+    max_wall_give_mm: Annotated[float, quantity("how far the wall may give", above=0.0, at_most=10.0)] = 1.0
     source: Annotated[str, text("where the numbers come from, or a text that begins with 'assumption'")] = (
         "assumption"
     )

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 
 import numpy as np
 
@@ -83,28 +84,22 @@ def legs_of(motion: ScopeMotion) -> Legs:
 
 
 class Simplifier:
-    """Looks for motions of fewer changes and twists to the end of a proved one, with room of `least_mm`.
+    """Looks for motions of fewer changes and twists to the end of a proved one, with room of `room_mm`.
 
     The device is the scope, and the largest curvature that what passes its channel can stand.
-    `end_bends_rad` are the bends farthest down and up of the section at the tip, and `least_mm` is the room
-    that a simpler motion keeps.
+    `ends_rad` are the bends farthest down and up of the section at the tip, and `room_mm` is the room that a
+    simpler motion keeps.
     """
 
     def __init__(
-        self,
-        walls: Walls,
-        device: Device,
-        motion: ScopeMotion,
-        *,
-        end_bends_rad: tuple[float, float],
-        least_mm: float,
+        self, walls: Walls, device: Device, motion: ScopeMotion, ends_rad: tuple[float, float], room_mm: float
     ) -> None:
-        self._walls, self._device, self._motion, self._least_mm = walls, device, motion, least_mm
+        self._walls, self._device, self._motion, self._least_mm = walls, device, motion, room_mm
         # So much more depth than needed is wanted: it becomes the tolerance of the steps.
         self._section = kernel.Section(length=device.length, radius=device.radius, spare_mm=0.5)
         laying = device.laying * device.length
         self._laid = max(device.least_bend, -laying), min(device.most_bend, laying)
-        self._end = end_bends_rad
+        self._end = ends_rad
         self._entry, self._target = frame_columns(motion.lps_from_entry), frame_columns(motion.lps_from_tip)
 
     def best(self) -> ScopeMotion:
@@ -149,8 +144,7 @@ class Simplifier:
             x = units * np.round(legs.unknowns / units)
             fixed = (bounds[:, 0] < x) & (x < bounds[:, 1])
             begin = 0
-            # So many of the last twists, bends and advances stay as they are: the six numbers of a pose need
-            # some.
+            # So many of the last twists, bends and advances are free: the six numbers of a pose need some.
             for count, free in zip((len(legs.twists), len(legs.bends), legs.count), (2, 4, 3), strict=True):
                 fixed[begin + max(count - free, 0) : begin + count] = False
                 begin += count
@@ -176,9 +170,8 @@ class Simplifier:
         """Yield legs with a change less, each with how much that changes before it is fitted, rad."""
         rows = legs.rows
         lengths = np.append(legs.advances, self._device.length)
-        vectors = (
-            rows[:, 1:2] / self._device.length * np.stack([np.cos(rows[:, 0]), np.sin(rows[:, 0])], axis=1)
-        )
+        ways = np.stack([np.cos(rows[:, 0]), np.sin(rows[:, 0])], axis=1)
+        vectors = rows[:, 1:2] / self._device.length * ways
         for group in range(len(legs.twists) - 1):
             yield self._tied(legs, group, vectors, lengths)
         for leg in range(legs.count - 1):
@@ -196,15 +189,14 @@ class Simplifier:
     def _tied(self, legs: Legs, group: int, vectors: Float, lengths: Float) -> tuple[float, Legs]:
         """Return legs with one twist for two groups of them."""
         first, second = legs.group == group, legs.group == group + 1
-        both, last = first | second, group + 2 == len(legs.twists)
+        both = first | second
         one, other = float(legs.twists[group]), float(legs.twists[group + 1])
-        weights = [
-            float((np.linalg.norm(vectors, axis=1) * lengths)[each].sum()) + 1e-12 for each in (first, second)
-        ]
+        turned = np.linalg.norm(vectors, axis=1) * lengths
+        weights = [float(turned[each].sum()) + 1e-12 for each in (first, second)]
         # A section bent the other way, half a turn on, is the same.
         near = one + math.pi * np.round((other - one) / math.pi)
         twist = (weights[0] * one + weights[1] * near) / sum(weights)
-        if last:
+        if group + 2 == len(legs.twists):
             twist += other - near
         twist = float(np.clip(twist, -MOST_TWIST_RAD, MOST_TWIST_RAD))
         along = vectors @ [math.cos(twist), math.sin(twist)]
@@ -212,9 +204,8 @@ class Simplifier:
         across = np.linalg.norm(vectors - along[:, None] * [math.cos(twist), math.sin(twist)], axis=1)
         twists = np.delete(legs.twists, group + 1)
         twists[group] = twist
-        tied = replace(
-            legs, group=legs.group - (legs.group > group), twists=twists, bends=bends[: len(legs.bends)]
-        )
+        groups = legs.group - (legs.group > group)
+        tied = replace(legs, group=groups, twists=twists, bends=bends[: len(legs.bends)])
         return float((across * lengths)[both].sum()), tied
 
     def _joined(self, legs: Legs, leg: int, vectors: Float, lengths: Float) -> tuple[float, Legs]:
@@ -229,13 +220,11 @@ class Simplifier:
         bends[leg] = along[kept - leg] * self._device.length
         advances = np.delete(legs.advances, leg)
         advances[leg] = whole
-        left = np.delete(legs.group, 2 * leg + 1 - kept)
-        used, group = np.unique(left, return_inverse=True)
+        used, group = np.unique(np.delete(legs.group, 2 * leg + 1 - kept), return_inverse=True)
         return float(change), Legs(group.astype(np.int64), legs.twists[used], bends, advances)
 
     def _fitted(self, legs: Legs, bounds: Float | None = None) -> Legs | None:
-        """Return proved legs near to some that end in the pose, None if none are found; bounds `(n, 2)` may
-        be narrower."""
+        """Return proved legs near to some that end in the pose, within bounds `(n, 2)`; None if not found."""
         x = legs.unknowns
         # Spacing of the places of a leg that are looked at as it is fitted: less than a lumen is wide.
         counts = np.ceil((np.append(legs.advances, 0.0) + self._device.length) / 2.0).astype(np.int64)
@@ -280,20 +269,14 @@ class Simplifier:
             choices.append([])
             for turns in (0,) if group == last else (0, -1, 1):
                 at, bends = twist + math.pi * turns, of_group * (-1.0) ** turns
-                if turns == 0 or (
-                    abs(at) <= MOST_TWIST_RAD
-                    and bends.min() >= self._laid[0]
-                    and bends.max() <= self._laid[1]
-                ):
+                laid = self._laid[0] <= bends.min() and bends.max() <= self._laid[1]
+                if turns == 0 or (laid and abs(at) <= MOST_TWIST_RAD):
                     choices[-1].append((at, turns))
         # The least twist in all, from the end back.
         ways: list[tuple[float, list[tuple[float, int]]]] = [(0.0, [one]) for one in choices[-1]]
         for options in choices[-2::-1]:
             ways = [
-                min(
-                    ((cost + abs(way[0][0] - one[0]), [one, *way]) for cost, way in ways),
-                    key=lambda each: each[0],
-                )
+                min(((cost + abs(way[0][0] - one[0]), [one, *way]) for cost, way in ways), key=itemgetter(0))
                 for one in options
             ]
         _, way = min(ways, key=lambda each: each[0] + abs(each[1][0][0]))

@@ -2,6 +2,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -69,11 +70,9 @@ def choices(contact: WallContact) -> list[list[Circumstances]]:
         stiffer, wall = np.exp(rng.uniform(-wide, wide)).tolist()
         frictions = rng.uniform(0.0, contact.max_friction, ATTEMPTS).tolist()
         slid = rng.uniform(-np.pi, np.pi, ATTEMPTS).tolist()
+        pairs = zip(frictions, slid, strict=True)
         made.append(
-            [
-                Circumstances(stiffer=stiffer, wall_stiffer=wall, friction=friction, slid_rad=way)
-                for friction, way in zip(frictions, slid, strict=True)
-            ]
+            [Circumstances(stiffer=stiffer, wall_stiffer=wall, friction=f, slid_rad=s) for f, s in pairs]
         )
     return made
 
@@ -83,7 +82,7 @@ def spread_of_tip(
 ) -> TipSpread:
     """Return the distribution of the resting tip of a motion about a pose, such as the planned one."""
     nominal, other = two_starts(shaft, motion)
-    off, force, give, held = [], [], [], 0
+    off: list[list[Float]] = []
 
     def at_rest(chosen: Circumstances) -> RestingShape:
         shape = shaft.rest(motion, chosen, start=nominal)
@@ -92,17 +91,11 @@ def spread_of_tip(
     # The kernels leave the interpreter alone, so that threads share the processors.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         rested = [list(pool.map(at_rest, attempts)) for attempts in choices(contact)]
-    for shapes in rested:
-        group = []
-        for shape in shapes:
-            if not shape.settled:
-                continue
-            group.append(off_pose(lps_from_pose, shape.lps_from_scope_tip))
-            force.append(shape.wall_force_n)
-            give.append(shape.most_give_mm)
-        held += len(group)
-        if len(group) > 1:
-            off.append(group)
+    settled = [[shape for shape in shapes if shape.settled] for shapes in rested]
+    held = [shape for shapes in settled for shape in shapes]
+    for shapes in settled:
+        if len(shapes) > 1:
+            off.append([off_pose(lps_from_pose, shape.lps_from_scope_tip) for shape in shapes])
     if other is not None and other.settled:
         off.append([off_pose(lps_from_pose, other.lps_from_scope_tip)])
     lost = off_pose(lps_from_pose, nominal.lps_from_scope_tip)
@@ -122,9 +115,9 @@ def spread_of_tip(
         attempt_mm=float(np.sqrt(within[:3].mean())),
         patient_deg=float(np.sqrt(between[3:].mean())),
         attempt_deg=float(np.sqrt(within[3:].mean())),
-        wall_force_n=np.array(force),
-        give_mm=np.array(give),
-        held_share=held / (PATIENTS * ATTEMPTS),
+        wall_force_n=np.array([shape.wall_force_n for shape in held]),
+        give_mm=np.array([shape.most_give_mm for shape in held]),
+        held_share=len(held) / (PATIENTS * ATTEMPTS),
     )
 
 
@@ -132,11 +125,8 @@ def two_starts(shaft: RestingShaft, motion: ScopeMotion) -> tuple[RestingShape, 
     """Return the resting shape from that as laid, and the one from a relaxed section if it differs."""
     states = motion.states.copy()
     states[-1, BEND] = 0.0
-    straight = ScopeMotion(
-        lps_from_entry=motion.lps_from_entry, states=states, bending_length_mm=motion.bending_length_mm
-    )
     nominal = shaft.rest(motion)
-    other = shaft.rest(motion, start=shaft.rest(straight, as_advanced=True))
+    other = shaft.rest(motion, start=shaft.rest(replace(motion, states=states), as_advanced=True))
     apart = off_pose(nominal.lps_from_scope_tip, other.lps_from_scope_tip)
     same = np.linalg.norm(apart[:3]) < SAME_MM and np.linalg.norm(apart[3:]) < SAME_DEG
     return nominal, None if same else other

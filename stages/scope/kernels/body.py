@@ -55,7 +55,7 @@ def arc_parts(kappa, length):
 
 @inner_kernel
 def move_along(base, u, v, length, out):
-    """Fill `out` (12,) with the frame at `length` mm along the arc that starts at a base frame."""
+    """Fill `out` (12,), which may be `base`, with the frame at `length` mm along the arc from the base."""
     kappa2 = u * u + v * v
     ahead, aside = arc_parts(math.sqrt(kappa2), length)
     for k in range(3):
@@ -212,14 +212,13 @@ def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
 
 
 @kernel()
-def motion_room(walls, radius, length, entry, states, finest, longest_step, where):
+def motion_room(walls, radius, length, entry, states, finest, stride, where):
     """Return a room that is there during a whole motion; `where` (1,) becomes the state where it is BLOCKED.
 
-    states : (M, 3) advance, twist and bend.  Steps that both advance and turn are not looked for here.
+    states : (M, 3) advance, twist and bend; stride : the longest step of a walk.  Steps that both advance and
+    turn are not looked for here.
     """
-    base = entry.copy()
-    moved = entry.copy()
-    least = math.inf
+    base, least, far = entry.copy(), math.inf, math.inf
     where[0] = -1
     for n in range(states.shape[0]):
         kappa = states[n, 2] / length
@@ -228,23 +227,18 @@ def motion_room(walls, radius, length, entry, states, finest, longest_step, wher
         last = n + 1 == states.shape[0]
         advance = 0.0 if last else states[n + 1, 0] - states[n, 0]
         if advance > 0.0 or last or n == 0:
-            room = room_along(walls, radius, base, u, v, 0.0, length + advance, 0.0, longest_step)
+            room = room_along(walls, radius, base, u, v, 0.0, length + advance, 0.0, stride)
         else:
             room = math.inf
         if room >= 0.0 and advance <= 0.0 and not last:
             twist, bend, to_twist, to_bend = states[n, 1], states[n, 2], states[n + 1, 1], states[n + 1, 2]
-            room = change_room(
-                walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step
-            )
+            room = change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, finest, stride)
             if room < 0.0:
                 # Short parts ask for room in more places: some changes are free by long parts only.
-                room = change_room(
-                    walls, radius, length, base, twist, bend, to_twist, to_bend, math.inf, math.inf
-                )
+                room = change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, far, far)
         if room < 0.0:
             where[0] = n
             return BLOCKED
         least = min(least, room)
-        move_along(base, u, v, advance, moved)
-        base[:] = moved
+        move_along(base, u, v, advance, base)
     return least

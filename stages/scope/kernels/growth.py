@@ -124,8 +124,7 @@ def follow(walls, device, before, state, by_straight, step):
     room = room_along(walls, device.radius, before, state[U], state[V], 0.0, far, 0.0, math.inf)
     if room < 0.0:
         return False
-    changed = state[TWIST] != before[TWIST] or state[BEND] != before[BEND]
-    if changed:
+    if state[TWIST] != before[TWIST] or state[BEND] != before[BEND]:
         turn = turn_room(
             walls, device.radius, device.length, before,
             before[TWIST], before[BEND], state[TWIST], state[BEND], by_straight,
@@ -211,8 +210,7 @@ def grow_layer(walls, device, route, states, offsets, step, out, parents, by_str
 @kernel()
 def put_first(walls, device, route, state):
     """Fill in the first state of a tree, of given base frame and route point; tell whether it is free."""
-    scratch = np.zeros(12)
-    settle(route, device.length, state, scratch)
+    settle(route, device.length, state, np.zeros(12))
     room = room_along(walls, device.radius, state, state[U], state[V], 0.0, device.length, 0.0, math.inf)
     state[ROOM] = room
     return room >= 0.0

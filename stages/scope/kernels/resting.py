@@ -184,8 +184,7 @@ def _arc_moves(frame, u, v, s, by):
 
 @inner_kernel
 def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step, gain):
-    """Carry the derivatives to the begin of arc `n`, fill step and gain; return the step's fall, -1: not
-    convex."""
+    """Carry the derivatives back over arc `n`, fill step and gain; return the step's fall, -1: not convex."""
     by, moved, cross = work[0:2], work[2:8], work[8:10]
     s, stiff = shaft.length[n], shaft.stiffness[n]
     u, v = curvature[n, 0], curvature[n, 1]
@@ -249,24 +248,20 @@ def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step,
     hess[3, 4] += 0.5 * (px * dy + py * dx)
     hess[3, 5] += 0.5 * (px * dz + pz * dx)
     hess[4, 5] += 0.5 * (py * dz + pz * dy)
-    hess[4, 3] = hess[3, 4]
-    hess[5, 3] = hess[3, 5]
-    hess[5, 4] = hess[4, 5]
     grad[3] += dy * pz - dz * py
     grad[4] += dz * px - dx * pz
     grad[5] += dx * py - dy * px
     for a in range(6):
         grad[a] += cross[0, a] * step[n, 0] + cross[1, a] * step[n, 1]
         for b in range(a, 6):
-            both = hess[a, b] + cross[0, a] * gain[n, 0, b] + cross[1, a] * gain[n, 1, b]
-            hess[a, b] = hess[b, a] = both
+            hess[a, b] += cross[0, a] * gain[n, 0, b] + cross[1, a] * gain[n, 1, b]
+            hess[b, a] = hess[a, b]
     return -0.5 * (q0 * step[n, 0] + q1 * step[n, 1])
 
 
 @inner_kernel
 def _back(lumen, shaft, frames, curvature, pull, damping, work, slope, grad, hess, step, gain):
-    """Find the step of every arc, from tip to entry; return the energy's expected fall, -1 where it is not
-    convex."""
+    """Find the step of every arc, from tip to entry; return the energy's expected fall, -1: not convex."""
     last = curvature.shape[0]
     expected = short = 0.0
     for k in range(3):
@@ -323,12 +318,10 @@ def _forth(shaft, size, frames, curvature, step, gain, to_frames, to_curvature):
 def bring_to_rest(lumen, shaft, entry, curvature, pull, frames, enough, most_steps):
     """Bring a shaft to rest: `curvature` (N, 2) becomes that of a shape of least energy.
 
-    Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps. A
-    step that is expected to lower the energy by less than `enough`, N mm, is not taken any more.
+    Returns the energy in N mm, what the next step is expected to be worth in N mm, and the number of steps.
 
     Args:
-        entry, frames ((12,), (N + 1, 12) float64): Frame in which the shaft begins; becomes those of arcs'
-            ends.
+        entry, frames ((12,), (N + 1, 12) float64): Frame in which the shaft begins; becomes those of ends.
         pull ((N, 3) float64): Forces on the ends of the arcs, N, which do not change with the shape.
         enough (float): No step is taken that is expected to lower the energy by less than this, N mm.
     """

@@ -67,9 +67,8 @@ def _look_at_section(walls, section, base, twist, bend, row, out):
     """Fill in the samples of a section in place; return the row after them."""
     for n in range(SECTION_SAMPLES):
         at = section.length * (n + 1) / SECTION_SAMPLES
-        out[row] = _shortfall(walls, section, base, twist, bend, at)
-        row += 1
-    return row
+        out[row + n] = _shortfall(walls, section, base, twist, bend, at)
+    return row + SECTION_SAMPLES
 
 
 @inner_kernel
@@ -115,8 +114,7 @@ def _look(walls, section, group, counts, x, bounds, target, first, bases, rows, 
         twist_before, bend_before = twist, bend
         if k < legs:
             kappa = bend / section.length
-            move_along(base, kappa * math.cos(twist), kappa * math.sin(twist), advance, moved)
-            base[:] = moved
+            move_along(base, kappa * math.cos(twist), kappa * math.sin(twist), advance, base)
     for i in range(x.shape[0]):
         # An unknown 1 rad or 1 mm beyond its bound costs as much as so many mm too near to the wall.
         out[row] = 20.0 * (max(0.0, bounds[i, 0] - x[i]) + max(0.0, x[i] - bounds[i, 1]))
@@ -158,12 +156,10 @@ def _step(slopes, begins, residuals, scale, damping, matrix, right):
                 total = 0.0
                 for r in range(max(begins[i], begins[j]), rows):
                     total += slopes[i, r] * slopes[j, r]
-                matrix[i, j] = total
-                matrix[j, i] = total
+                matrix[i, j] = matrix[j, i] = total
         matrix[i, i] += (damping if damping > 0.0 else 1.0) / scale[i] ** 2
         for e in range(EQUATIONS):
-            matrix[i, n + e] = slopes[i, rows + e]
-            matrix[n + e, i] = slopes[i, rows + e]
+            matrix[i, n + e] = matrix[n + e, i] = slopes[i, rows + e]
     for e in range(EQUATIONS):
         right[n + e] = -residuals[rows + e]
     return solve_in_place(matrix, right) != 0.0
@@ -310,7 +306,7 @@ def prove_legs(walls, radius, length, entry, legs, finest, longest_step, least, 
     orders : (K + 1,), filled in with the order of twist and bend in each change: the first that keeps the
     room.
     """
-    base, moved = entry.copy(), entry.copy()
+    base = entry.copy()
     before = np.zeros(2)
     room = room_along(walls, radius, base, 0.0, 0.0, 0.0, length, 0.0, longest_step)
     for k in range(legs.shape[0]):
@@ -319,24 +315,20 @@ def prove_legs(walls, radius, length, entry, legs, finest, longest_step, least, 
         room = min(room, room_along(walls, radius, base, u, v, 0.0, length + legs[k, 2], 0.0, longest_step))
         if room < least:
             return BLOCKED
-        first, tries = TOGETHER, 1
+        tried = (TOGETHER, TOGETHER, TOGETHER)
         if legs[k, 0] != before[0] and legs[k, 1] != before[1]:
-            first, tries = (TWIST_FIRST if abs(before[1]) <= abs(legs[k, 1]) else BEND_FIRST), 3
+            tried = (TWIST_FIRST, BEND_FIRST, BY_STRAIGHT)
+            if abs(before[1]) > abs(legs[k, 1]):
+                tried = (BEND_FIRST, TWIST_FIRST, BY_STRAIGHT)
         found = BLOCKED
-        for n in range(tries):
-            order = first
-            if n == 1:
-                order = BEND_FIRST if first == TWIST_FIRST else TWIST_FIRST
-            elif n == 2:
-                order = BY_STRAIGHT
+        for order in tried:
             orders[k] = order
             found = _order_room(walls, radius, length, base, before, legs[k], order, finest, longest_step)
-            if found >= least:
+            if found >= least or order == TOGETHER:
                 break
         room = min(room, found)
         if room < least:
             return BLOCKED
         before[0], before[1] = legs[k, 0], legs[k, 1]
-        move_along(base, u, v, legs[k, 2], moved)
-        base[:] = moved
+        move_along(base, u, v, legs[k, 2], base)
     return room

@@ -10,14 +10,7 @@ import numpy as np
 
 from anatomy.base.typed import Bool, Float, Int
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
-from stages.scope.kernels.body import (
-    BLOCKED,
-    along_setting,
-    move_along,
-    nearest_setting,
-    room_along,
-    turn_room,
-)
+from stages.scope.kernels.body import BLOCKED, move_along, nearest_setting, room_along, turn_room
 from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
 
 HALVINGS = 12
@@ -108,8 +101,7 @@ def kind_of(places, near, tip):
     side = 0
     # Nearer to the axis tips count as on it: about a voxel and a half.
     if off2 > 1.0**2:
-        towards = x * tip[3] + y * tip[4] + z * tip[5] - along * cosine
-        side = 1 if towards >= 0.0 else 2
+        side = 1 if x * tip[3] + y * tip[4] + z * tip[5] - along * cosine >= 0.0 else 2
     if ring == 0 and side == 0:
         return places.slots[0, near], cost
     spoke = 0
@@ -237,9 +229,7 @@ def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
     Where there is no such way, the tip is that of the motion itself.
     """
     length = device.length
-    base = entry.copy()
-    moved = entry.copy()
-    scratch = np.zeros(12)
+    base, moved, scratch = entry.copy(), entry.copy(), np.zeros(12)
     slide = last_slide(states)
     stop, twist, bend = states[-1]
     done = np.zeros(shifts.shape[0], dtype=np.bool_)
@@ -262,43 +252,31 @@ def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
                 rooms[k] = turn_room(
                     walls, device.radius, length, moved, held_twist, held_bend, twist, bend, straight
                 )
-        move_along(base, u, v, min(end, stop) - begin, moved)
-        base[:] = moved
+        move_along(base, u, v, min(end, stop) - begin, base)
     for k in range(shifts.shape[0]):
         if not done[k]:
             put_tip(base, twist, bend, length, tips[k], scratch)
 
 
 @inner_kernel
-def _spare(walls, radius, length, base, setting, far, growth, more):
-    """Return the largest change `D` of curvature at which all of an arc has (D / 2 + growth) s^2 mm; 0 if
-    none."""
-    u = setting[1] / length * math.cos(setting[0])
-    v = setting[1] / length * math.sin(setting[0])
-    if room_along(walls, radius, base, u, v, 0.0, far, 0.5 * more + growth, LONGEST_MM) >= 0.0:
-        return more
-    low, high = 0.0, more
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        if room_along(walls, radius, base, u, v, 0.0, far, 0.5 * middle + growth, LONGEST_MM) >= 0.0:
-            low = middle
-        else:
-            high = middle
-    return low
+def _most_error(walls, radius, base, u, v, begin, end, growth, longer, wider, most):
+    """Return the largest error, 0 to `most`, at which an arc has room from `begin` to `end` mm; 0 if none.
 
-
-@inner_kernel
-def _beyond(walls, radius, base, u, v, far):
-    """Return how much farther than `far` mm a section may go on along its arc."""
-    if room_along(walls, radius, base, u, v, far, far + MOST_MM, 0.0, LONGEST_MM) >= 0.0:
-        return MOST_MM
-    low, high = 0.0, MOST_MM
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        if room_along(walls, radius, base, u, v, far, far + middle, 0.0, LONGEST_MM) >= 0.0:
-            low = middle
+    An error of `x` makes the arc `longer * x` mm longer, and asks for `wider * x + growth` times s^2 mm of
+    room `s` mm from the base.
+    """
+    low, high, error = 0.0, most, most
+    for _ in range(HALVINGS + 1):
+        room = room_along(
+            walls, radius, base, u, v, begin, end + longer * error, wider * error + growth, LONGEST_MM
+        )
+        if room < 0.0:
+            high = error
+        elif error == most:
+            return most
         else:
-            high = middle
+            low = error
+        error = 0.5 * (low + high)
     return low
 
 
@@ -315,39 +293,30 @@ def step_tolerances(walls, radius, length, entry, states, finest, out):
     states : (M, 3) advance, twist and bend; finest : a change in place is looked at in pieces that move the
     tip by no more than this.
     """
-    base, moved = entry.copy(), entry.copy()
-    setting = np.zeros(2)
+    base = entry.copy()
     laid = 0.0
     for n in range(states.shape[0] - 1):
-        advance = states[n + 1, 0] - states[n, 0]
-        kappa = max(abs(states[n, 2]), abs(states[n + 1, 2])) / length
+        advance, to_twist, to_bend = states[n + 1] - states[n]
+        twist, bend = states[n, 1], states[n, 2]
+        kappa = max(abs(bend), abs(states[n + 1, 2])) / length
         if advance > 0.0:
-            setting[:] = states[n, 1:]
-            u = setting[1] / length * math.cos(setting[0])
-            v = setting[1] / length * math.sin(setting[0])
-            spare = _spare(walls, radius, length, base, setting, length + advance, 0.0, MOST_RAD / length)
-            out[n, 0] = _beyond(walls, radius, base, u, v, length + advance)
-            move_along(base, u, v, advance, moved)
-            base[:] = moved
-            laid = abs(setting[1]) / length
+            u, v = bend / length * math.cos(twist), bend / length * math.sin(twist)
+            far = length + advance
+            spare = _most_error(walls, radius, base, u, v, 0.0, far, 0.0, 0.0, 0.5, MOST_RAD / length)
+            out[n, 0] = _most_error(walls, radius, base, u, v, far, far, 0.0, 1.0, 0.0, MOST_MM)
+            move_along(base, u, v, advance, base)
+            laid = abs(bend) / length
         else:
-            change = math.hypot(
-                states[n + 1, 2] - states[n, 2], kappa * length * (states[n + 1, 1] - states[n, 1])
-            )
-            change /= length
+            change = math.hypot(to_bend, kappa * length * to_twist) / length
             pieces = max(1, int(math.ceil(0.5 * change * length * length / finest)))
             spare, room = MOST_RAD / length, math.inf
+            # Between two pieces each place is within a quarter of their change of one of them.
+            growth = 0.25 * change / pieces
             for m in range(pieces + 1):
-                share = m / pieces
-                setting[0] = states[n, 1] + share * (states[n + 1, 1] - states[n, 1])
-                setting[1] = states[n, 2] + share * (states[n + 1, 2] - states[n, 2])
-                # Between two pieces each place is within a quarter of their change of one of them.
-                growth = 0.25 * change / pieces
-                spare = _spare(walls, radius, length, base, setting, length, growth, spare)
-                room = min(
-                    room,
-                    along_setting(walls, radius, length, base, setting[0], setting[1], growth, LONGEST_MM),
-                )
+                at_twist, kappa_there = twist + m / pieces * to_twist, (bend + m / pieces * to_bend) / length
+                u, v = kappa_there * math.cos(at_twist), kappa_there * math.sin(at_twist)
+                spare = _most_error(walls, radius, base, u, v, 0.0, length, growth, 0.0, 0.5, spare)
+                room = min(room, room_along(walls, radius, base, u, v, 0.0, length, growth, LONGEST_MM))
             out[n, 0] = min(MOST_MM, max(room, 0.0) / (1.0 + max(kappa, laid) * length))
         out[n, 1] = min(MOST_RAD, spare / max(kappa, 1e-12))
         out[n, 2] = spare * length

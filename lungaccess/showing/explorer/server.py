@@ -26,7 +26,7 @@ from lungaccess.showing.explorer.messages import error_message, frame
 from lungaccess.showing.explorer.processes import NAMES, Process
 from lungaccess.showing.explorer.questions import ANSWERS, CANCEL, MOST_CHARACTERS, number_of, read_message
 from lungaccess.showing.explorer.worker import Asked, Ended, Given, KeptPlan, PatientSource
-from lungaccess.showing.report.html.document import filled, scene_figure, slice_controls
+from lungaccess.showing.report.html.document import GLSL, asset, filled, scene_figure, slice_controls
 
 HOST = "127.0.0.1"
 TOKEN_BYTES = 24
@@ -271,15 +271,15 @@ class Explorer:
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
         is_open = self._source.folder is not None and request.path == "/"
+        template = asset(PAGE if is_open else OPENING, FOLDERS["explorer"])
         parts = {"scene": scene_figure(more_notes=CLICKS), "slice_controls": slice_controls(more=REACH)}
-        text = filled(page_text("explorer", PAGE), parts) if is_open else page_text("explorer", OPENING)
-        return web.Response(text=text, content_type="text/html")
+        return web.Response(text=filled(template, parts), content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.StreamResponse:
         folder, name = request.match_info["folder"], request.match_info["name"]
         if folder not in FOLDERS or name not in asset_names(folder):
             raise web.HTTPNotFound
-        return web.Response(text=page_text(folder, name), content_type=KINDS[Path(name).suffix])
+        return web.Response(text=asset(name, FOLDERS[folder]), content_type=KINDS[Path(name).suffix])
 
     async def _download(self, request: web.Request) -> web.StreamResponse:
         file = self._files.get(request.match_info["ticket"])
@@ -429,9 +429,5 @@ def _same(given: str, token: str) -> bool:
 def asset_names(folder: str) -> frozenset[str]:
     """Return the names of modules and style sheets in one of `FOLDERS`."""
     entries = (resources.files(FOLDERS[folder]) / "page").iterdir()
-    return frozenset(each.name for each in entries if Path(each.name).suffix in KINDS)
-
-
-def page_text(folder: str, name: str) -> str:
-    """Return the text of a file of the page."""
-    return (resources.files(FOLDERS[folder]) / "page" / name).read_text(encoding="utf-8")
+    made = [GLSL] if folder == "report" else []
+    return frozenset([*made, *(each.name for each in entries if Path(each.name).suffix in KINDS)])

@@ -1,5 +1,6 @@
 """One HTML file of templates, style sheet, scripts and data: complete in itself, nothing is fetched."""
 
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -10,19 +11,27 @@ from typing import Any
 from anatomy.base.files import write_text
 from lungaccess.showing.report.pack import script_text
 
+GLSL = "glsl.js"
+"""The module that is made of `shaders/`, so that programs are files of their own language."""
 SHARED_MODULES = (
-    "decode.js", "vectors.js", "colours.js", "surfaces.js", "shaders.js", "layers.js", "picking.js",
+    "decode.js", "vectors.js", "colours.js", "surfaces.js", GLSL, "shaders.js", "layers.js", "picking.js",
     "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
     "structures.js", "slice_panel.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 _IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)
 _HOLE = re.compile(r"\{\{(\w+)\}\}")
+_INCLUDE = re.compile(r'^#include "(.+)"$', re.MULTILINE)
 
 
-def asset(name: str) -> str:
-    """Return the text of a file of the page."""
-    return (resources.files("lungaccess.showing.report") / "page" / name).read_text(encoding="utf-8")
+def asset(name: str, package: str = "lungaccess.showing.report") -> str:
+    """Return the text of a file; `GLSL` exports all of `shaders/` by name, with what each includes."""
+    page = resources.files(package) / "page"
+    if name != GLSL:
+        return (page / name).read_text(encoding="utf-8")
+    texts = {each.name: each.read_text(encoding="utf-8") for each in (page / "shaders").iterdir()}
+    whole = {key: _INCLUDE.sub(lambda piece: texts[piece[1]], texts[key]) for key in sorted(texts)}
+    return f"export const GLSL = {json.dumps(whole)};\n"
 
 
 def bundle(names: Sequence[str]) -> str:

@@ -16,8 +16,9 @@ import pytest
 
 from anatomy.base.errors import SettingsError
 from lungaccess.showing.explorer import Explorer, PatientSource
-from lungaccess.showing.explorer.server import FOLDERS, asset_names, page_text
+from lungaccess.showing.explorer.server import FOLDERS, asset_names
 from lungaccess.showing.explorer.worker import Given
+from lungaccess.showing.report.html.document import asset
 from lungaccess.showing.report.reach import COLOURS
 from tests.lungaccess.showing.explorer.client import Client, opened, serving, source_of, with_client
 
@@ -87,7 +88,7 @@ def test_with_the_token_the_page_and_its_modules_are_served_and_kept_nowhere() -
 
 
 def test_the_legend_of_the_reach_has_the_colours_of_the_map() -> None:
-    sheet = page_text("explorer", "explorer.css")
+    sheet = asset("explorer.css", FOLDERS["explorer"])
     for name, kind in (("direct", "direct arc"), ("unreachable", "unreachable")):
         assert f".swatch.{name} {{ background: {COLOURS[kind]}; }}" in sheet
 
@@ -141,13 +142,13 @@ def test_the_socket_wants_the_origin_of_the_page() -> None:
 
 def test_the_page_has_no_style_and_no_script_of_its_own() -> None:
     """What the policy forbids would be left out by the browser without a word to the user."""
-    assert "<script>" not in page_text("explorer", "explorer.html")
+    assert "<script>" not in asset("explorer.html", FOLDERS["explorer"])
     for folder in FOLDERS:
         for name in (
             *asset_names(folder),
             *(("explorer.html",) if folder == "explorer" else ("scene.html",)),
         ):
-            text = page_text(folder, name)
+            text = asset(name, FOLDERS[folder])
             assert 'style="' not in text and "onclick=" not in text
             assert not any(
                 word in text for word in ("innerHTML", "eval(", "insertAdjacentHTML", "document.write")

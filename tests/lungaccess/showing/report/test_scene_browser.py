@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from itertools import permutations
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from lungaccess.showing.report.html import document
 from tests.lungaccess.showing.report import browser
 from tests.lungaccess.showing.report.made_scene import (
     DISTANCE_MM,
@@ -33,6 +35,10 @@ pytestmark = [
 
 DIRECTIONS = ((0, -1, 0), (0, 1, 0), (1, 0, 0), (0.4, -0.3, 0.86), (-0.6, -0.5, -0.62))
 MIDDLE = SIDE_PX / 2
+COMPILE = """const { gl } = made.scene, [name, text] = arguments;
+const shader = gl.createShader(name.endsWith("vert") ? gl.VERTEX_SHADER : gl.FRAGMENT_SHADER);
+gl.shaderSource(shader, text); gl.compileShader(shader);
+return gl.getShaderParameter(shader, gl.COMPILE_STATUS) ? "" : gl.getShaderInfoLog(shader);"""
 RED, BLUE, GREEN, YELLOW = "#c03030", "#3030c0", "#30a030", "#d0b020"
 
 
@@ -56,6 +62,18 @@ def plate(
     mesh = trimesh.creation.box(extents=[60.0, 4.0, 60.0])
     mesh.apply_translation(np.array(back) * (depth_mm - 2.0))
     return body(mesh, key, colour, opacity)
+
+
+def test_every_program_of_the_graphics_card_compiles(page: browser.Browser) -> None:
+    """Each file as it lies there, as a validator reads it, and what puts together none and many layers."""
+    texts = json.loads(document.asset(document.GLSL).removeprefix("export const GLSL = ").rstrip(";\n"))
+    assert len(texts) == 10 and all("#include" not in text for text in texts.values())
+    for name, text in texts.items():
+        if not name.endswith(".glsl"):
+            assert page.run(COMPILE, name, text) == "", name
+    assert page.run(COMPILE, "wrong.frag", texts["layer.frag"].replace("float depth", "float other")) != ""
+    for counts in ((0, 0), (1, 0), (3, 2), (16, 0), (16, 16)):
+        page.run("made.scene.programs.together(...arguments)", *counts)
 
 
 @pytest.mark.parametrize("back", DIRECTIONS)

@@ -303,10 +303,12 @@ class WallContact:
     max_friction: Annotated[
         float, quantity("largest coefficient of friction on the wall", at_least=0.0, at_most=2.0)
     ] = 0.2
-    max_wall_force_n: Annotated[float, quantity("most force on 10 mm of wall", above=0.0, at_most=100.0)] = (
-        1.0
-    )
-    max_wall_give_mm: Annotated[float, quantity("how far the wall may give", above=0.0, at_most=10.0)] = 1.0
+    max_wall_force_n: Annotated[
+        float, quantity("largest force on 10 mm of wall", above=0.0, at_most=100.0)
+    ] = 1.0
+    max_wall_give_mm: Annotated[
+        float, quantity("how far the wall may be pressed in", above=0.0, at_most=10.0)
+    ] = 1.0
     source: Annotated[str, text("where the numbers come from, or a text that begins with 'assumption'")] = (
         "assumption"
     )

@@ -254,8 +254,8 @@ def _back_over_arc(shaft, frames, curvature, n, damping, work, grad, hess, step,
     for a in range(6):
         grad[a] += cross[0, a] * step[n, 0] + cross[1, a] * step[n, 1]
         for b in range(a, 6):
-            hess[a, b] += cross[0, a] * gain[n, 0, b] + cross[1, a] * gain[n, 1, b]
-            hess[b, a] = hess[a, b]
+            both = hess[a, b] + cross[0, a] * gain[n, 0, b] + cross[1, a] * gain[n, 1, b]
+            hess[a, b] = hess[b, a] = both
     return -0.5 * (q0 * step[n, 0] + q1 * step[n, 1])
 
 

@@ -38,6 +38,7 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.request import Request
 from lungaccess.problem.task import Task
+from lungaccess.uncertainty.risk.statistics import Share
 
 BY_COST = 300
 """Iterations of the search by cost whose plans take part: more make them only a little cheaper."""
@@ -45,6 +46,8 @@ RARE, ENOUGH = 0.05, 0.3
 """Where hardly a draw succeeds, the errors are made smaller until so many do: few successes tell nothing."""
 SMALLER, LEAST_FACTOR = 0.7, 0.1
 """The step by which the errors are made smaller, and the least size."""
+OFTEN_ENOUGH = 0.98
+"""A plan that succeeds at least so often, with 95 %, ends the search: others gain too little."""
 
 
 @frozen_record
@@ -278,8 +281,11 @@ class ContestFinder:
         return rating.stated(made, most)
 
     def is_met(self, best: Plan, iteration: int) -> bool:
-        """Tell that nothing is good enough: the best possible is not known."""
-        return False
+        """Tell whether draws that no search has seen leave less than two of hundred to gain."""
+        if best.chance is None:
+            return False
+        counted = Share(count=best.chance.successes, samples=best.chance.samples)
+        return counted.interval[0] >= OFTEN_ENOUGH
 
     def last(self, best: Plan, iteration: int, elapsed_s: float) -> Plan | None:
         """Return the leader with what it states, where the search ended before that was shown."""

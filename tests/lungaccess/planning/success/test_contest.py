@@ -102,6 +102,22 @@ class TestChances:
         assert first.tube.rotation_rad == last.tube.rotation_rad
         assert first.chance is None and last.chance is not None
 
+    def test_the_search_ends_where_little_is_left_to_gain(
+        self, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        challenges: list[finder.Contender] = []
+
+        def noted(self: finder.ContestFinder, best: finder.Contender, other: finder.Contender) -> Any:
+            challenges.append(other)
+            return beats(self, best, other)
+
+        beats = finder.ContestFinder._beats
+        monkeypatch.setattr(finder.ContestFinder, "_beats", noted)
+        *_, sure = la.plan(**asked | {"errors": ERRORS.scaled(0.05)})
+        assert share(sure) > finder.OFTEN_ENOUGH and not challenges
+        *_, unsure = la.plan(**asked)
+        assert share(unsure) < finder.OFTEN_ENOUGH and challenges
+
     def test_where_hardly_a_draw_succeeds_smaller_errors_tell(
         self, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch
     ) -> None:

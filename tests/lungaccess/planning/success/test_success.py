@@ -84,12 +84,12 @@ def test_it_succeeds_more_often_than_the_plan_of_least_cost(
 
 
 @pytest.mark.slow
-def test_a_search_without_time_estimates_its_plan_with_all_draws(
+def test_a_search_without_time_estimates_its_plan_with_few_draws(
     small_lung: Lung, atlas: la.Atlas, targets: list[Target]
 ) -> None:
     first, last = found(small_lung, atlas, targets[0], iterations=None, time_s=0.0)
     assert first.tube.rotation_rad == last.tube.rotation_rad
-    assert first.chance is None and last.chance is not None and last.chance.samples == OPEN_LOOP.fresh
+    assert first.chance is None and last.chance is not None and last.chance.samples == 250
 
 
 @pytest.mark.slow
@@ -152,8 +152,8 @@ def test_without_errors_every_candidate_is_certain(
 
 
 @pytest.mark.slow
-def test_where_there_is_no_plan_it_says_why(small_lung: Lung, atlas: la.Atlas, targets: list[Target]) -> None:
+def test_where_there_is_no_plan_it_says_why(small_lung: Lung, targets: list[Target]) -> None:
     short = replace(SYSTEM, name="short", needle=replace(SYSTEM.needle, max_length_mm=1.0))
     with pytest.raises(la.NoPlan) as failure:
-        next(la.plan(small_lung, short, targets[0], atlas=atlas, counterfactuals=False))
+        next(la.plan(small_lung, short, targets[0], counterfactuals=False))
     assert failure.value.reasons

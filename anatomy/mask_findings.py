@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
+from anatomy import morphology
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.typed import Array, Float, Int, Mask
 from anatomy.base.words import percent
@@ -11,16 +12,6 @@ from anatomy.display import point
 from anatomy.grid import Grid
 from anatomy.landmarks import SAMPLE_MM, directions
 from anatomy.lobes import LOBES, RIGHT_LOWER
-from anatomy.morphology import (
-    bounds,
-    components,
-    distance_mm,
-    grown_by_one,
-    lattice_of,
-    pieces_of,
-    sampled,
-    window,
-)
 from anatomy.patient import PatientImages
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 
@@ -77,7 +68,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         within = _count(fissures & lung)
         yield "fissures_of_lungs", within / _count(lung)
         yield "fissures_in_lungs", within / _count(fissures)
-        sheet = sampled(fissures & lung, images.grid, SAMPLE_MM / 2)
+        sheet = morphology.sampled(fissures & lung, images.grid, SAMPLE_MM / 2)
         if len(sheet):
             # Fissures that end as near to the surface of the lungs reach it.
             yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, 3.0)).any(1).mean())
@@ -94,7 +85,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
             yield from _of_nodules(nodules, lung, images.grid)
             if images.nodule_labels is not None:
                 # How many nodules that do not touch have the same label, where most have.
-                voxels, part = components(nodules)
+                voxels, part = morphology.components(nodules)
                 named = np.stack([images.nodule_labels.array[tuple(voxels.T)], part], axis=1)
                 yield "nodule_pieces", float(np.bincount(np.unique(named, axis=0)[:, 0]).max())
     if images.lobes is not None:
@@ -131,15 +122,15 @@ def _of_lungs(
     """Yield what about one voxel in every cube of `SAMPLE_MM` tells of the lungs."""
     from scipy import ndimage
 
-    lattice = lattice_of(grid, SAMPLE_MM)
+    lattice = morphology.lattice_of(grid, SAMPLE_MM)
     coarse = np.pad(lung[lattice], 1)
-    sizes = pieces_of(coarse, corners=True)[1][1:]
+    sizes = morphology.pieces_of(coarse, corners=True)[1][1:]
     total = float(max(sizes.sum(), 1))
     # A piece with less than this share of the lungs is no lung.
     yield "lung_pieces", float(sizes[sizes < 0.05 * total].sum()) / total
     outside, _ = ndimage.label(~coarse)
     yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
-    points = sampled(lung, grid, SAMPLE_MM)
+    points = morphology.sampled(lung, grid, SAMPLE_MM)
     if len(points):
         wide, _, tall = np.ptp(points, axis=0) + SAMPLE_MM
         yield "tall_lungs", float(tall / wide)
@@ -170,20 +161,20 @@ def _of_airway(lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, 
 
 def share_at_lumen(wall: Mask, lumen: Mask, grid: Grid) -> float:
     """Return the share of a wall near the lumen."""
-    box = window(*bounds(wall | lumen))
+    box = morphology.window(*morphology.bounds(wall | lumen))
     # Walls are up to 3 mm thick, and their inner voxels share a face with the lumen.
-    near = distance_mm(~lumen[box], grid.spacing_mm) <= 4.0
+    near = morphology.distance_mm(~lumen[box], grid.spacing_mm) <= 4.0
     return float(np.count_nonzero(near & wall[box])) / _count(wall)
 
 
 def _of_nodules(nodules: Mask, lung: Mask, grid: Grid) -> Iterator[tuple[str, float]]:
     """Yield how much of the nodules lies in, at and beyond the lungs, and how compact the largest one is."""
-    voxels, part = components(nodules)
-    box = window(*bounds(nodules, 1))
-    near = grown_by_one(np.asfortranarray(lung[box]))
+    voxels, part = morphology.components(nodules)
+    box = morphology.window(*morphology.bounds(nodules, 1))
+    near = morphology.grown_by_one(np.asfortranarray(lung[box]))
     touches = np.bincount(part, weights=near[tuple((voxels - [axis.start for axis in box]).T)]) > 0
     yield "nodules_at_lungs", float(touches[part].mean())
-    beyond_mm = distance_mm(~lung[box], grid.spacing_mm)[nodules[box]]
+    beyond_mm = morphology.distance_mm(~lung[box], grid.spacing_mm)[nodules[box]]
     yield "nodules_beyond_lungs_mm", float(beyond_mm.max(initial=0.0))
     largest = voxels[part == np.argmax(np.bincount(part))]
     yield "nodule_filled", len(largest) / float(np.prod(np.ptp(largest, axis=0) + 1))
@@ -202,10 +193,10 @@ def _flattest(places: Int, part: Int) -> float:
 
 
 def _of_lobes(lobes: Array, lung: Mask, grid: Grid, tree: AirwayTree) -> Iterator[tuple[str, float]]:
-    lattice = lattice_of(grid, SAMPLE_MM)
+    lattice = morphology.lattice_of(grid, SAMPLE_MM)
     numbers, inside = lobes[lattice], lung[lattice]
     yield "lobes_of_lungs", _count((numbers > 0) & inside) / _count(inside)
-    points, number = sampled(lobes > 0, grid, SAMPLE_MM), numbers[numbers > 0]
+    points, number = morphology.sampled(lobes > 0, grid, SAMPLE_MM), numbers[numbers > 0]
     on_left = points[:, 0] > tree.carina_lps[0]
     yield "lobes_on_side", float(np.mean(on_left == (number > RIGHT_LOWER))) if len(number) else 1.0
 

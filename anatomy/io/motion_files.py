@@ -14,17 +14,8 @@ from anatomy.base.files import read_text, reading, reason, require_file, unreada
 from anatomy.base.settings import quantity, settings, switch, text
 from anatomy.base.typed import Array, Float
 from anatomy.grid import Grid, transform_points
-from anatomy.io import transform_values
+from anatomy.io import images, transform_values
 from anatomy.io.frames import LPS_FROM, LPS_FROM_RAS, MOST_COORDINATE_MM
-from anatomy.io.images import (
-    SUFFIXES,
-    image_suffix,
-    itk_image,
-    open_image,
-    read_mask,
-    read_volume,
-    write_image,
-)
 from anatomy.io.voxels import read_array
 from anatomy.motion.source import MotionSource
 
@@ -114,7 +105,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
         )
     common: dict[str, Any] = {key: getattr(keys, key) for key in ("masks_phase", "amplitude", "hysteresis")}
     if keys.other_lungs:
-        common["other_lungs"] = read_mask(folder / keys.other_lungs, role="lung")
+        common["other_lungs"] = images.read_mask(folder / keys.other_lungs, role="lung")
     if keys.population:
         words = f"population: other people's motion by height, {keys.population_motion_mm:g} mm"
         return MotionSource(description=words, population_motion_mm=keys.population_motion_mm, **common)
@@ -141,7 +132,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
             remedy='Write maps_from = "end-exhale" where end-exhale was the fixed image of the registration, '
             'else maps_from = "end-inhale"',
         )
-    grid, vectors = read_transform(path, masks) if image_suffix(path) is None else read_vectors(path)
+    grid, vectors = read_transform(path, masks) if images.image_suffix(path) is None else read_vectors(path)
     return MotionSource(
         description=f"displacement of {keys.file}, from {keys.maps_from}",
         maps_from=keys.maps_from,
@@ -184,7 +175,7 @@ def read_vectors(path: Path) -> tuple[Grid, Float]:
     number is not finite.
     """
     with reading(path):
-        header, stream = open_image(path, None, components=3)
+        header, stream = images.open_image(path, None, components=3)
         vectors = read_array(header, stream, path)
     if header.vectors_are_ras:
         vectors = vectors * LPS_FROM_RAS.diagonal()[:3].astype(vectors.dtype)
@@ -200,7 +191,7 @@ def read_transform(path: Path, masks: Grid) -> tuple[Grid, Float]:
     if path.suffix.lower() not in TRANSFORMS:
         raise FileError(
             f"{path} is of an unknown kind",
-            expected=f"a displacement field ({', '.join(SUFFIXES)}), an ITK transform "
+            expected=f"a displacement field ({', '.join(images.SUFFIXES)}), an ITK transform "
             f"({', '.join(TRANSFORMS)}) or landmark pairs ({LANDMARKS})",
             remedy="Export the registration in one of them",
         )
@@ -241,7 +232,7 @@ def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
 
     Raises FileError if the folder cannot be written to.
     """
-    write_image(itk_image(vectors.astype(np.float32), grid), Path(path), components=3)
+    images.write_image(images.itk_image(vectors.astype(np.float32), grid), Path(path), components=3)
 
 
 def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
@@ -294,7 +285,7 @@ def _image(path: Path) -> tuple[Any, bool]:
     """Return an image on voxels of `WORKING_MM` along LPS, and whether it is a mask."""
     from scipy import ndimage
 
-    volume = read_volume(path)
+    volume = images.read_volume(path)
     values = volume.array
     if values.min() == values.max():
         raise AnatomyError(f"{path} has one value everywhere", expected="a CT, or a mask of the lungs")
@@ -309,4 +300,4 @@ def _image(path: Path) -> tuple[Any, bool]:
         inside = out > 0.5 * float(values.max())
         out = ndimage.distance_transform_edt(inside, sampling=WORKING_MM)
         out = np.clip(out - ndimage.distance_transform_edt(~inside, sampling=WORKING_MM), -DEPTH_MM, DEPTH_MM)
-    return itk_image(out.astype(np.float32), coarse), is_mask
+    return images.itk_image(out.astype(np.float32), coarse), is_mask

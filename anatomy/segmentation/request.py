@@ -12,16 +12,9 @@ from anatomy.base.records import frozen_record, frozen_value
 from anatomy.base.typed import Array, Float
 from anatomy.base.words import percent
 from anatomy.grid import Grid, Volume
+from anatomy.io import mask_values
 from anatomy.io.ct_cases import ct_case
 from anatomy.io.images import images_in, read_volume
-from anatomy.io.mask_values import (
-    file_and_label,
-    is_whole,
-    mask_of,
-    parse_labels,
-    require_label_values,
-    select,
-)
 from anatomy.io.masks import SOLID, MaskSource, place, read_masks
 from anatomy.io.totalsegmentator import file_sources, mask_sources
 from anatomy.segmentation.box import VOXEL_MM
@@ -107,9 +100,9 @@ def _read(image: str, path: Path) -> _Read:
             return _of_sources(image, mask_sources(path)[0], path.name)
         read = _read(image, own)
         return replace(read, source=f"{read.source} ({case.data_set})")
-    file, stated = file_and_label(path)
+    file, stated = mask_values.file_and_label(path)
     if file != path:
-        labels = parse_labels(stated)
+        labels = mask_values.parse_labels(stated)
         if labels is None:
             raise FileError(
                 f"{path.name} names no labels",
@@ -128,12 +121,12 @@ def _of_file(image: str, path: Path, labels: tuple[int, ...], source: str) -> _R
     volume = read_volume(path)
     array: Array = volume.array
     said: tuple[str, ...] = ()
-    has_labels = image == "lobes" or (image in LABELLED and is_whole(array))
+    has_labels = image == "lobes" or (image in LABELLED and mask_values.is_whole(array))
     if has_labels:
-        require_label_values(array, path.name)
-        array = np.where(select(array, labels), array, array.dtype.type(0)) if labels else array
+        mask_values.require_label_values(array, path.name)
+        array = np.where(mask_values.select(array, labels), array, array.dtype.type(0)) if labels else array
     if not has_labels or (image == "fissures" and array.max() > SEEN):
-        array, said = mask_of(
+        array, said = mask_values.mask_of(
             volume.array,
             path.name,
             voxel_mm3=volume.grid.voxel_volume_mm3,
@@ -264,7 +257,7 @@ class Given:
         named = (self.totalsegmentator, self.onnx_airway, self.nodule_contours, self.nodule_mask)
         found: dict[str, str] = {}
         for path in (path for path in (*self.files().values(), *named) if path is not None):
-            file, _label = file_and_label(path)
+            file, _label = mask_values.file_and_label(path)
             found |= {str(each): sha256(each) for each in (images_in(file) if file.is_dir() else [file])}
         return found
 

@@ -7,15 +7,7 @@ from typing import Any, get_type_hints
 
 import numpy as np
 from pydantic import GetCoreSchemaHandler
-from pydantic_core import CoreSchema
-from pydantic_core.core_schema import (
-    CoreConfig,
-    float_schema,
-    list_schema,
-    no_info_after_validator_function,
-    typed_dict_field,
-    typed_dict_schema,
-)
+from pydantic_core import CoreSchema, core_schema
 
 from anatomy.base.errors import PlanFileError
 from anatomy.base.records import LEFT_OUT_IF_EMPTY
@@ -43,7 +35,7 @@ class Record:
     def __get_pydantic_core_schema__(cls, _source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         hints = get_type_hints(cls)
         keys = {
-            each.name: typed_dict_field(
+            each.name: core_schema.typed_dict_field(
                 _numbers(*each.metadata["shape"])
                 if "shape" in each.metadata
                 else handler.generate_schema(hints[each.name]),
@@ -51,10 +43,10 @@ class Record:
             )
             for each in fields(cls)  # type: ignore[arg-type]
         }
-        return no_info_after_validator_function(
+        return core_schema.no_info_after_validator_function(
             lambda stated: cls(**stated),
-            typed_dict_schema(
-                keys, strict=True, extra_behavior="forbid", config=CoreConfig(allow_inf_nan=False)
+            core_schema.typed_dict_schema(
+                keys, strict=True, extra_behavior="forbid", config=core_schema.CoreConfig(allow_inf_nan=False)
             ),
         )
 
@@ -73,8 +65,10 @@ class Record:
 def _numbers(*shape: int | None) -> CoreSchema:
     """Return the schema of an array of numbers, row in row; its records judge whether they are whole."""
     if not shape:
-        return float_schema(strict=True, allow_inf_nan=False)
-    return list_schema(_numbers(*shape[1:]), strict=True, min_length=shape[0], max_length=shape[0])
+        return core_schema.float_schema(strict=True, allow_inf_nan=False)
+    return core_schema.list_schema(
+        _numbers(*shape[1:]), strict=True, min_length=shape[0], max_length=shape[0]
+    )
 
 
 def _frozen_array(value: Any, shape: tuple[int | None, ...], dtype: type, name: str) -> Array:

@@ -11,7 +11,7 @@ from anatomy import structures
 from anatomy.base.errors import LungaccessError
 from anatomy.base.typed import Float, Labels
 from anatomy.shafts import SlottedSegment
-from lungaccess.judging.checking import shapes
+from lungaccess.judging.checking import clearances, shapes
 from lungaccess.judging.checking.boxes import (
     Environment,
     PathDistances,
@@ -19,12 +19,6 @@ from lungaccess.judging.checking.boxes import (
     branch_of,
     has,
     labels_at,
-)
-from lungaccess.judging.checking.clearances import (
-    REACH_MM,
-    check_clear,
-    check_stated_clearance,
-    structures_known,
 )
 from lungaccess.judging.checking.findings import (
     ANGLE_TOLERANCE_RAD,
@@ -218,8 +212,8 @@ def _check_out_of_lumen(environment: Environment, curve: Curve, way_out: Exit, f
     begin = [np.interp(begin_mm, curve.arc_mm, curve.points[:, axis]) for axis in range(3)]
     points = np.concatenate([[begin], curve.points[curve.arc_mm > begin_mm]])
     needed = np.full(len(points) - 1, OUT_OF_LUMEN_MM)
-    boxes = environment.boxes(has(structures.LUMEN), REACH_MM)
-    check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
+    boxes = environment.boxes(has(structures.LUMEN), clearances.REACH_MM)
+    clearances.check_clear("tube.beyond_wall.lumen", boxes, points, needed, found, limited=True)
 
 
 def rim(frames: Float, radius_mm: Float) -> Float:
@@ -256,15 +250,15 @@ def _check_clearance(
         ("fissure", has(structures.FISSURE), contact),
         ("airway", airway_except(way_out.branch), way_out.frame),
     ]
-    for name, select, first in structures_known(cases, "tube", environment.lung, found):
-        boxes = environment.boxes(select, REACH_MM)
-        least = check_clear(
+    for name, select, first in clearances.structures_known(cases, "tube", environment.lung, found):
+        boxes = environment.boxes(select, clearances.REACH_MM)
+        least = clearances.check_clear(
             f"tube.clearance.{name}", boxes, curve.points[first:], needed[first:], found,
             limited=name != "fissure" or plan.fissures_are_obstacles,
         )  # fmt: skip
         most = PathDistances(boxes, curve.points[way_out.frame :]).least_mm()
         diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
-        check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
+        clearances.check_stated_clearance(plan, "tube", name, (least, most), diagonal, found)
 
 
 SHAPE_TOLERANCE_MM = 1e-3

@@ -11,14 +11,8 @@ from numpy.typing import ArrayLike
 
 from anatomy import structures
 from anatomy.base.typed import Bool, Float
+from lungaccess.judging.checking import clearances
 from lungaccess.judging.checking.boxes import Environment, Select, airway_except, branch_of, has, labels_at
-from lungaccess.judging.checking.clearances import (
-    CLEARANCE_TOLERANCE_MM,
-    REACH_MM,
-    check_clear,
-    check_stated_clearance,
-    structures_known,
-)
 from lungaccess.judging.checking.findings import (
     ANGLE_TOLERANCE_RAD,
     LENGTH_TOLERANCE_MM,
@@ -141,11 +135,11 @@ def _check_clearance(
     ]
     nearest = _check_clear(cases, environment, curve, found, fissures=plan.fissures_are_obstacles)
     # Towards the airway counts all of it behind the exempt length, and other branches before.
-    airway = min(nearest.pop("airway", REACH_MM), nearest.pop("other_airway", REACH_MM))
+    airway = min(nearest.pop("airway", clearances.REACH_MM), nearest.pop("other_airway", clearances.REACH_MM))
     nearest.pop("lumen", None)
     diagonal = float(np.linalg.norm(environment.lung.grid.spacing_mm))
     for name, exact in {**nearest, "airway": airway}.items():
-        check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
+        clearances.check_stated_clearance(plan, "needle", name, (exact, exact), diagonal, found)
 
 
 def _check_clear(
@@ -153,15 +147,15 @@ def _check_clear(
 ) -> dict[str, float]:
     """Record whether a needle, as capsules padded by the sagitta, keeps its distances; return the least."""
     nearest: dict[str, float] = {}
-    for name, select, where, needed in structures_known(cases, "needle", environment.lung, found):
+    for name, select, where, needed in clearances.structures_known(cases, "needle", environment.lung, found):
         frames = np.flatnonzero(where)
         if not len(frames) or frames[0] == len(where) - 1:
             continue
         # An exempt run reaches the next frame.
         first, last = int(frames[0]), min(int(frames[-1]) + 1, len(where) - 1)
-        nearest[name] = check_clear(
+        nearest[name] = clearances.check_clear(
             f"needle.clearance.{name}",
-            environment.boxes(select, REACH_MM),
+            environment.boxes(select, clearances.REACH_MM),
             curve.points[first : last + 1],
             needed + curve.sagitta_mm[first:last],
             found,
@@ -245,8 +239,8 @@ def _check_exit(
     if not exempt.any():
         return
     points, arc = curve.points[exempt], curve.arc_mm[exempt]
-    required, tolerance = system.track_radius_mm + system.margins.total_mm, CLEARANCE_TOLERANCE_MM
-    gap = float(environment.boxes(airway_except(*branches), REACH_MM).distance_mm(points).min())
+    required, tolerance = system.track_radius_mm + system.margins.total_mm, clearances.CLEARANCE_TOLERANCE_MM
+    gap = float(environment.boxes(airway_except(*branches), clearances.REACH_MM).distance_mm(points).min())
     found.at_least("needle.clearance.other_airway", gap, required, "mm", "to branches not pierced", tolerance)
     kept = np.full(len(points), system.track_radius_mm)
     if at_wall:
@@ -255,7 +249,7 @@ def _check_exit(
         points, kept = points[arc >= WALL_ZONE_MM - TINY_MM], kept[arc >= WALL_ZONE_MM - TINY_MM]
     if not len(points):
         return
-    distance = environment.boxes(has(structures.LUMEN), REACH_MM).distance_mm(points)
+    distance = environment.boxes(has(structures.LUMEN), clearances.REACH_MM).distance_mm(points)
     worst = int((distance - kept).argmin())
     found.at_least(
         "needle.clearance.lumen", float(distance[worst]), float(kept[worst]), "mm", "near the exit", tolerance

@@ -20,13 +20,7 @@ from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.coupled.search.direct_arcs import costs_of_tubes
 from lungaccess.planning.coupled.search.local_search import TubeChoice, path_through, tube_arguments
 from lungaccess.planning.one_stage.needle import needle_question, reason_in_words
-from lungaccess.plans.assemble import (
-    needle_clearance_mm,
-    needle_part,
-    stated_costs,
-    tube_clearance_mm,
-    tube_part,
-)
+from lungaccess.plans import assemble
 from lungaccess.plans.candidate import with_tool_in_place
 from lungaccess.plans.evaluator import TOO_LITTLE, CandidateEvaluator
 from lungaccess.plans.kernels.tissue import taken_at
@@ -70,27 +64,27 @@ class RestOfPlan:
         """The tubes as a plan states them, None where they stand already."""
         if self.deployment is None:
             return None
-        return tube_part(self.task, self.lps_from_measured, self.deployment)
+        return assemble.tube_part(self.task, self.lps_from_measured, self.deployment)
 
     @cached_property
     def needle(self) -> NeedlePath | None:
         """The needle as a plan states it; None where the system has none, and the tubes end at the target."""
-        return None if self.task.system.needle is None else needle_part(self.path)
+        return None if self.task.system.needle is None else assemble.needle_part(self.path)
 
     @cached_property
     def clearance_mm(self) -> Mapping[str, Mapping[str, float]]:
         """As that of a plan."""
         clearance = {}
         if self.task.system.needle is not None:
-            clearance["needle"] = needle_clearance_mm(self.task, self.path, self.branch)
+            clearance["needle"] = assemble.needle_clearance_mm(self.task, self.path, self.branch)
         if self.deployment is not None:
-            clearance["tube"] = tube_clearance_mm(self.task, self.lps_from_measured, self.deployment)
+            clearance["tube"] = assemble.tube_clearance_mm(self.task, self.lps_from_measured, self.deployment)
         return clearance
 
     @cached_property
     def costs(self) -> Mapping[str, float]:
         """As those of a plan."""
-        return stated_costs(self.task, self.lps_from_measured, self.deployment, self.path)
+        return assemble.stated_costs(self.task, self.lps_from_measured, self.deployment, self.path)
 
     @property
     def objective(self) -> str:

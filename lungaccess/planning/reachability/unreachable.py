@@ -18,13 +18,7 @@ from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.lung import Lung
 from anatomy.structures import BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER
-from lungaccess.planning.reachability.deployment_space import (
-    DeploymentSpace,
-    divided_space,
-    in_tasks,
-    place_pieces,
-    places_of_tips,
-)
+from lungaccess.planning.reachability import deployment_space
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment
 from lungaccess.planning.reachability.kernels.deployment_boxes import BOX_COLUMNS, PLACE_X
 from lungaccess.planning.reachability.kernels.unreachable import (
@@ -66,7 +60,7 @@ class OpenPlace:
     narrowest: bool
 
 
-def open_places(lung: Lung, space: DeploymentSpace, found: Found) -> tuple[OpenPlace, ...]:
+def open_places(lung: Lung, space: deployment_space.DeploymentSpace, found: Found) -> tuple[OpenPlace, ...]:
     """Merge what is open into places, the largest share of the deployment space first."""
     tree = lung.tree
     rows = np.flatnonzero(found.outcome != RULED_OUT)
@@ -197,16 +191,16 @@ class UnreachableProof:
         )
         self._passable: dict[bytes, np.ndarray] = {}
         self._least_depth_mm = system.scope.radius_mm + system.scope.lumen_margin_mm
-        tips, centres = places_of_tips(lung, self._not_lumen, self._least_depth_mm)
+        tips, centres = deployment_space.places_of_tips(lung, self._not_lumen, self._least_depth_mm)
         self._tips = distance_corners(tips, spacing_mm)
         pause()
-        pieces = place_pieces(lung, centres, leaving, float(self._insertions.max()))
-        self._space = divided_space(
+        pieces = deployment_space.place_pieces(lung, centres, leaving, float(self._insertions.max()))
+        self._space = deployment_space.divided_space(
             self._surroundings(self._masks[0]), self._tubes, self._insertions, pieces, between=pause
         )
 
     @property
-    def space(self) -> DeploymentSpace:
+    def space(self) -> deployment_space.DeploymentSpace:
         """The deployments that there may be, whatever the target."""
         return self._space
 
@@ -274,7 +268,7 @@ class UnreachableProof:
                         rule_out(*about, some, most, to_the_end, found)
 
                     # Looks that a thread may take at a time.
-                    yield from in_tasks(pool, work, rows, max(16384 // most, 1))
+                    yield from deployment_space.in_tasks(pool, work, rows, max(16384 // most, 1))
                     # A box is given so many times as many looks as in the round before, so that rounds repeat
                     # little.
                     most *= 16

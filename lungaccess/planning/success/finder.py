@@ -21,16 +21,8 @@ from lungaccess.planning.coupled.search.base import AtlasBound, Step
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates, direct_candidates
 from lungaccess.planning.coupled.search.window_search import SMALLEST, random_change, varied
 from lungaccess.planning.driver import Turn, holds, no_plan_beside
+from lungaccess.planning.success import ratings
 from lungaccess.planning.success.passes import with_passes
-from lungaccess.planning.success.ratings import (
-    ChanceRating,
-    FunctionRating,
-    Rating,
-    Scorer,
-    ranked,
-    rating_of,
-    standard_error,
-)
 from lungaccess.plans.assemble import with_devices
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -63,7 +55,7 @@ class Contender:
 
     candidate: Candidate
     plan: Plan
-    scorer: Scorer
+    scorer: ratings.Scorer
     gained: float = 0.0
     draws: int = 0
     shrunken: float = 0.0
@@ -87,7 +79,7 @@ class ContestFinder:
         self._request, self._task, self._atlas = request, task, atlas
         self._plan_of = partial(searches.plan_of, request, task, atlas)
         self._counterfactuals = counterfactuals
-        self._rating = rating_of(request) or FunctionRating(request)
+        self._rating = ratings.rating_of(request) or ratings.FunctionRating(request)
         self._search = searches.search_of(request, task, atlas)
         self._steps = self._search.steps()
         self._model: Plan | None = None
@@ -108,7 +100,7 @@ class ContestFinder:
         self._leader = first
         yield Turn(iteration=0, phase="search", make=partial(self._plan_of, first.candidate, 0))
         of_cost = yield from self._by_cost(first)
-        entries = [] if self._direct is None else ranked(self._rating, self._direct).tolist()
+        entries = [] if self._direct is None else ratings.ranked(self._rating, self._direct).tolist()
         pool = (made for made in map(self._entry, entries) if made)
         screened = (yield from self._screened(of_cost)) if self._measures else []
         started = [*of_cost, *screened, *islice(pool, self._rating.rounds.pool)]
@@ -119,7 +111,7 @@ class ContestFinder:
     @property
     def _measures(self) -> bool:
         """Whether procedures are simulated that measure on their way."""
-        return isinstance(self._rating, ChanceRating) and not self._rating.procedure.is_open_loop
+        return isinstance(self._rating, ratings.ChanceRating) and not self._rating.procedure.is_open_loop
 
     def _first(self) -> Generator[Turn, None, Contender | None]:
         """Return the first plan of the search by cost that keeps the constraints, None if there is none."""
@@ -145,9 +137,9 @@ class ContestFinder:
 
     def _screened(self, of_cost: Sequence[Contender]) -> Generator[Turn, None, list[Contender]]:
         """Return those that do best in open loop; the first of them stays to the end."""
-        rating = ChanceRating(self._request, open_loop=True)
+        rating = ratings.ChanceRating(self._request, open_loop=True)
         direct = self._direct
-        entries = [] if direct is None else ranked(rating, direct).tolist()
+        entries = [] if direct is None else ratings.ranked(rating, direct).tolist()
         others = (made for made in map(partial(self._entry, rating=rating), entries) if made)
         again = [self._contender(each.candidate, rating) for each in of_cost]
         order = yield from self._halved(rating, [*again, *islice(others, rating.rounds.pool)], leads=False)
@@ -159,12 +151,12 @@ class ContestFinder:
         """Return what a step of the search by cost has found, if it keeps the constraints."""
         return None if step.candidate is None else self._contender(step.candidate)
 
-    def _entry(self, entry: int, rating: Rating | None = None) -> Contender | None:
+    def _entry(self, entry: int, rating: ratings.Rating | None = None) -> Contender | None:
         direct = self._direct
         candidate = None if direct is None else direct.proved(entry)
         return None if candidate is None else self._contender(candidate, rating)
 
-    def _contender(self, candidate: Candidate, rating: Rating | None = None) -> Any:
+    def _contender(self, candidate: Candidate, rating: ratings.Rating | None = None) -> Any:
         """Return a candidate as a contender, None if it misses a constraint."""
         plan = self._plan(candidate)
         if not holds(self._request, plan):
@@ -174,14 +166,14 @@ class ContestFinder:
 
     def _plan(self, candidate: Candidate) -> Plan:
         """Return a plan with the devices of a candidate, a whole one for a rating that may ask for all."""
-        if isinstance(self._rating, FunctionRating) or self._model is None:
+        if isinstance(self._rating, ratings.FunctionRating) or self._model is None:
             self._model = self._plan_of(candidate, 0, 0.0)
             return self._model
         made = with_devices(self._task, candidate, self._model)
         return searches.with_aim(made, self._request) if self._request.is_for_window else made
 
     def _halved(
-        self, rating: Rating, contenders: Sequence[Contender], *, leads: bool = True
+        self, rating: ratings.Rating, contenders: Sequence[Contender], *, leads: bool = True
     ) -> Generator[Turn, None, list[Contender]]:
         """Return contenders, the best first: in each round fewer of them have more draws."""
         left, factor = list(contenders), 1.0
@@ -204,7 +196,7 @@ class ContestFinder:
     def _challenged(self, best: Contender, pool: Iterator[Contender]) -> Iterator[Turn]:
         """Let the rest of the pool, variations of the best, and the search by cost challenge the best."""
         rng = np.random.Generator(np.random.PCG64(self._task.seed))
-        size, varies = 1.0, not (isinstance(self._rating, ChanceRating) and self._rating.replans)
+        size, varies = 1.0, not (isinstance(self._rating, ratings.ChanceRating) and self._rating.replans)
         for tried in count(1):
             other = None
             if tried % 3 == 0:
@@ -242,7 +234,7 @@ class ContestFinder:
         """Return another contender if it gains more: after each round it has to be near the best."""
         for number, draws in enumerate(self._rating.rounds.draws):
             other = _counted(other, number, draws)
-            error = standard_error(best.share, other.draws) if draws > 1 else 0.0
+            error = ratings.standard_error(best.share, other.draws) if draws > 1 else 0.0
             if other.share < best.share - 2.0 * error:
                 return None
         return other if other.gained > best.gained else None
@@ -250,7 +242,7 @@ class ContestFinder:
     @property
     def _message(self) -> str:
         leader = self._leader
-        if leader is None or not leader.draws or isinstance(self._rating, FunctionRating):
+        if leader is None or not leader.draws or isinstance(self._rating, ratings.FunctionRating):
             return ""
         return f"succeeds in {percent(leader.share)} of the draws"
 
@@ -275,7 +267,7 @@ class ContestFinder:
         """Return the whole plan of a contender with what it states of the goal."""
         make = partial(self._plan_of, iteration=iteration, elapsed_s=elapsed_s)
         made, rating, direct = make(contender.candidate), self._rating, self._direct
-        if self._request.passes > 1 and isinstance(rating, ChanceRating):
+        if self._request.passes > 1 and isinstance(rating, ratings.ChanceRating):
             ways = direct or direct_candidates(self._task, self._atlas)
             made = with_passes(self._request, rating, ways, contender.candidate, make)
         return rating.stated(made, most)

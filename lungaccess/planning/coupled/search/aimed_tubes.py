@@ -19,13 +19,7 @@ from lungaccess.planning.coupled.kernels.aimed_tubes import (
     SPOILT_WAY,
     aim_tubes,
 )
-from lungaccess.planning.coupled.search.base import (
-    ESTIMATE_SLACK,
-    ParallelSearch,
-    Step,
-    different,
-    evaluated_step,
-)
+from lungaccess.planning.coupled.search import base
 from lungaccess.plans.candidate import Candidate, tubes_in_tissue
 from lungaccess.plans.evaluator import CandidateEvaluator
 from lungaccess.problem.system import System
@@ -296,7 +290,7 @@ ROWS_MM = (evenly(0.25, 4.0), evenly(0.02, 0.26))
 as far as the next, then between the best of these and its neighbours."""
 
 
-class TubeSearch(ParallelSearch):
+class TubeSearch(base.ParallelSearch):
     """Aims the tubes at the target from the tips of the atlas, then from tips along the motions of the best.
 
     It ends when it has looked along the motions of all tips with a deployment to the target that differ.
@@ -310,7 +304,7 @@ class TubeSearch(ParallelSearch):
         super().__init__(self.evaluator.blocked)
         self.clear: Int = np.zeros(0, dtype=np.int64)
 
-    def direct_steps(self) -> Iterator[Step]:
+    def direct_steps(self) -> Iterator[base.Step]:
         """Aim from the tips of the atlas, those first from which a deployment ends nearest."""
         clear, costs = [self.clear], [np.zeros(0)]
         near, phase = self.arcs.promising, "aiming the tubes"
@@ -319,34 +313,34 @@ class TubeSearch(ParallelSearch):
             found, why = self.arcs.aim(chunk)
             self.blocked.update(self.arcs.reasons(why))
             order = cheapest_first(found)
-            yield Step(iteration=0, phase=phase)
+            yield base.Step(iteration=0, phase=phase)
             yield from self._finalists(phase, chunk[order], found[order])
             clear.append(chunk[order])
             costs.append(found[order, COST])
         self.clear = np.concatenate(clear)[np.argsort(np.concatenate(costs), kind="stable")]
 
-    def _finalists(self, phase: str, entries: Int, found: Float) -> Iterator[Step]:
+    def _finalists(self, phase: str, entries: Int, found: Float) -> Iterator[base.Step]:
         """Evaluate the cheapest in full, as long as one may be better than all before."""
         # Proved deployments of a chunk: the estimated costs by which they are chosen may be in the wrong
         # order.
         left = 3
         for entry, row in zip(entries.tolist(), found, strict=True):
-            if not left or row[COST] > ESTIMATE_SLACK * self.incumbent.cost:
+            if not left or row[COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
                 return
             made = self.arcs.made(self.arcs.tip(entry), row)
-            step = evaluated_step(self.evaluator, phase, made)
+            step = base.evaluated_step(self.evaluator, phase, made)
             left -= step.candidate is not None
             yield self.incumbent.improved(step)
 
-    def further_steps(self) -> Iterator[Step]:
+    def further_steps(self) -> Iterator[base.Step]:
         """Look along the motions, the cheapest first; each motion is an iteration."""
         number, parts = self.share
-        ordered = different(self.atlas.deployments, self.clear)[number::parts]
+        ordered = base.different(self.atlas.deployments, self.clear)[number::parts]
         for iteration, entry in enumerate(ordered.tolist(), start=1):
             step = self._shifted(int(entry))
             yield self.incumbent.improved(replace(step, iteration=iteration))
 
-    def _shifted(self, entry: int) -> Step:
+    def _shifted(self, entry: int) -> base.Step:
         """Return the best deployment from tips along the motion to that of an entry."""
         phase, tubes = "looking along the motion of the scope", self.task.system.tubes
         first = self.arcs.aim(np.array([entry]))[0][0]
@@ -361,6 +355,6 @@ class TubeSearch(ParallelSearch):
             order = cheapest_first(rows)
             if len(order) and rows[order[0], COST] < best[COST]:
                 best, tip = rows[order[0]], self.evaluator.tip_rows.tip(row, int(order[0]))
-        if best is first or best[COST] > ESTIMATE_SLACK * self.incumbent.cost:
-            return Step(iteration=0, phase=phase)
-        return evaluated_step(self.evaluator, phase, self.arcs.made(tip, best))
+        if best is first or best[COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
+            return base.Step(iteration=0, phase=phase)
+        return base.evaluated_step(self.evaluator, phase, self.arcs.made(tip, best))

@@ -14,15 +14,7 @@ from anatomy.base.typed import Float, Int, UInt64
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.candidate import SCOPE_POSE
 from lungaccess.planning.coupled.kernels.local_search import sample_deployments
-from lungaccess.planning.coupled.search.base import (
-    ESTIMATE_SLACK,
-    DirectSearch,
-    ParallelSearch,
-    SearchSettings,
-    Step,
-    different,
-    evaluated_step,
-)
+from lungaccess.planning.coupled.search import base
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs, DirectArcSearch
 from lungaccess.planning.coupled.search.local_search import LocalSearch, LocalSearchRun, TubeChoice
 from lungaccess.planning.coupled.search.needle_planner import PLANNER, NamedNeedlePlanner, needle_searches
@@ -41,7 +33,7 @@ class LocalSearchRounds:
         self._local_search, self._evaluator = local_search, search.evaluator
         self._incumbent, self._settings = search.incumbent, search.settings
 
-    def halve(self, runs: list[LocalSearchRun]) -> Iterator[Step]:
+    def halve(self, runs: list[LocalSearchRun]) -> Iterator[base.Step]:
         """Advance runs by successive halving: after each rung the better half goes on."""
         rungs = successive_halving(
             runs,
@@ -54,7 +46,7 @@ class LocalSearchRounds:
             for run in left:
                 yield from self._advanced(run, iterations)
 
-    def intensify(self) -> Iterator[Step]:
+    def intensify(self) -> Iterator[base.Step]:
         """Continue the local search from the best candidate."""
         run = self._local_search.begin(self._incumbent.candidate)
         if run is not None:
@@ -70,34 +62,38 @@ class LocalSearchRounds:
             self._local_search.perturb(run)
         return runs
 
-    def _advanced(self, run: LocalSearchRun, iterations: int) -> Iterator[Step]:
+    def _advanced(self, run: LocalSearchRun, iterations: int) -> Iterator[base.Step]:
         """Advance a run by iterations; the last step has what it has found."""
         for n in range(1, iterations + 1):
             # Variations of an iteration, which takes about a millisecond.
             self._local_search.advance(run, 50)
             # A run is evaluated in full only when its estimated cost has fallen by this factor, to save time.
-            limit = min(0.999 * run.evaluated_cost, ESTIMATE_SLACK * self._incumbent.cost)
+            limit = min(0.999 * run.evaluated_cost, base.ESTIMATE_SLACK * self._incumbent.cost)
             if n < iterations or not run.cost < limit:
-                yield Step(iteration=0, phase=self.phase)
+                yield base.Step(iteration=0, phase=self.phase)
             else:
                 run.evaluated_cost = run.cost
-                yield evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
+                yield base.evaluated_step(self._evaluator, self.phase, self._local_search.candidate(run))
 
 
-class AtlasSearch(ParallelSearch):
+class AtlasSearch(base.ParallelSearch):
     """Direct arcs of the whole atlas, then rounds of local search, sampling, needle search and refinement."""
 
     def __init__(
-        self, task: Task, atlas: Atlas, settings: SearchSettings | None = None, arcs: DirectArcs | None = None
+        self,
+        task: Task,
+        atlas: Atlas,
+        settings: base.SearchSettings | None = None,
+        arcs: DirectArcs | None = None,
     ) -> None:
         self.task = task
         self.atlas = atlas
-        self.settings = settings or SearchSettings()
+        self.settings = settings or base.SearchSettings()
         self.arcs = arcs or DirectArcs(task, atlas)
         self.evaluator = self.arcs.evaluator
         super().__init__(self.evaluator.blocked)
         self._needle_planner = NamedNeedlePlanner(self.evaluator, PLANNER)
-        self.direct: DirectSearch = DirectArcSearch(self.arcs, self.incumbent, self.settings)
+        self.direct: base.DirectSearch = DirectArcSearch(self.arcs, self.incumbent, self.settings)
         self._rng = np.random.Generator(np.random.PCG64(task.seed))
         self._refined_cost = math.inf
 
@@ -114,16 +110,16 @@ class AtlasSearch(ParallelSearch):
         super().take_part(number, parts)
         self._rng = np.random.Generator(np.random.PCG64([self.task.seed, number]))
 
-    def direct_steps(self) -> Iterator[Step]:
+    def direct_steps(self) -> Iterator[base.Step]:
         """Evaluate the direct arcs, nearest first."""
         return self.direct.steps()
 
-    def further_steps(self) -> Iterator[Step]:
+    def further_steps(self) -> Iterator[base.Step]:
         """Continue from the direct arcs without end; each step is an iteration."""
         for number, step in enumerate(self._rounds(), start=1):
             yield self.incumbent.improved(replace(step, iteration=number))
 
-    def _rounds(self) -> Iterator[Step]:
+    def _rounds(self) -> Iterator[base.Step]:
         """Start from the best direct arcs, then intensify the best candidate and try new starts, in turns."""
         if not self.atlas.deployments.count:
             return
@@ -156,7 +152,7 @@ class AtlasSearch(ParallelSearch):
         """
         number, parts = self.share
         clear = self.direct.clear
-        first = different(self.atlas.deployments, clear)[number::parts].tolist()
+        first = base.different(self.atlas.deployments, clear)[number::parts].tolist()
         refused: set[int] = set()
         while first or len(refused) < len(clear):
             entry = first.pop(0) if first else int(self._rng.choice(clear))
@@ -168,16 +164,16 @@ class AtlasSearch(ParallelSearch):
             else:
                 refused.add(entry)
 
-    def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[Step, Candidate | None]]:
+    def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[base.Step, Candidate | None]]:
         """Sample deployments near those of the atlas whose needle reaches the target, or nearly does."""
         sampling = sampling_near_target(local_search, self.arcs, self._rng)
-        nothing = Step(iteration=0, phase="local sampling")
+        nothing = base.Step(iteration=0, phase="local sampling")
         while True:
             found = sampling.sample(self.settings.kept_slack * self.incumbent.cost)
             first = self.incumbent.step is None
-            yield evaluated_step(self.evaluator, nothing.phase, found) if first else nothing, found
+            yield base.evaluated_step(self.evaluator, nothing.phase, found) if first else nothing, found
 
-    def _refined(self) -> Iterator[Step]:
+    def _refined(self) -> Iterator[base.Step]:
         """Improve scope pose, tubes and needle of the best candidate together, by a nonlinear program."""
         from lungaccess.planning.refinement import refine
 
@@ -187,7 +183,7 @@ class AtlasSearch(ParallelSearch):
             return
         before = self.incumbent.cost
         end = replace(self.task.target, lps_mm=self.evaluator.end_of(best.path))
-        step = evaluated_step(
+        step = base.evaluated_step(
             self.evaluator, "joint refinement", refine(replace(self.task, target=end), best)
         )
         self._refined_cost = min(before, step.cost)
@@ -236,7 +232,7 @@ def sampling_near_target(
 
     Up to half of MOST are different ones that may reach it at the least cost; the others miss it by least.
     """
-    inside = different(arcs.atlas.deployments, arcs.by_bound[0])[: MOST // 2]
+    inside = base.different(arcs.atlas.deployments, arcs.by_bound[0])[: MOST // 2]
     target, most = arcs.task.target.lps_mm, MOST - len(inside)
     needle = arcs.evaluator.environment.needle
     outside = nearly_reaching(arcs.atlas, needle, target, most)

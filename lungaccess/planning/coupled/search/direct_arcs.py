@@ -10,13 +10,7 @@ from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.direct_arcs import PRUNED_BY_BOUND, cost_bounds, evaluate_arcs
 from lungaccess.planning.coupled.kernels.tubes_cost import costs_in_tissue
-from lungaccess.planning.coupled.search.base import (
-    ESTIMATE_SLACK,
-    Incumbent,
-    SearchSettings,
-    Step,
-    evaluated_step,
-)
+from lungaccess.planning.coupled.search import base
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator, blocker_counts
 from lungaccess.problem.task import Task
@@ -209,11 +203,11 @@ class DirectArcSearch:
 
     phase = "direct arcs"
 
-    def __init__(self, arcs: DirectArcs, incumbent: Incumbent, settings: SearchSettings) -> None:
+    def __init__(self, arcs: DirectArcs, incumbent: base.Incumbent, settings: base.SearchSettings) -> None:
         self._arcs, self._incumbent, self._settings = arcs, incumbent, settings
         self.clear: Int = np.zeros(0, dtype=np.int64)
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[base.Step]:
         """Yield a step for each chunk, and one for each arc of it that is proved in full."""
         found, estimates, cheapest = [], [], math.inf
         near, evaluator = self._arcs.in_workspace, self._arcs.evaluator
@@ -224,13 +218,13 @@ class DirectArcSearch:
             clear = np.flatnonzero((blockers == 0) & np.isfinite(costs))
             found.append(chunk[clear])
             estimates.append(costs[clear])
-            yield Step(iteration=0, phase=self.phase)
+            yield base.Step(iteration=0, phase=self.phase)
             # Proved arcs of a chunk: the estimated costs by which they are chosen may be in the wrong order.
             left = 3
             for n in clear[np.argsort(costs[clear], kind="stable")].tolist():
-                if not left or costs[n] > ESTIMATE_SLACK * self._incumbent.cost:
+                if not left or costs[n] > base.ESTIMATE_SLACK * self._incumbent.cost:
                     break
-                step = evaluated_step(evaluator, self.phase, self._arcs.candidate(int(chunk[n])))
+                step = base.evaluated_step(evaluator, self.phase, self._arcs.candidate(int(chunk[n])))
                 left -= step.candidate is not None
                 yield self._incumbent.improved(step)
         if found:

@@ -12,14 +12,7 @@ import numpy as np
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.search.base import (
-    Incumbent,
-    ParallelSearch,
-    SearchSettings,
-    Step,
-    different,
-    evaluated_step,
-)
+from lungaccess.planning.coupled.search import base
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.plans.candidate import Candidate
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -86,23 +79,23 @@ class NamedNeedlePlanner:
 def needle_searches(
     arcs: DirectArcs,
     planner: NamedNeedlePlanner,
-    incumbent: Incumbent,
-    settings: SearchSettings,
+    incumbent: base.Incumbent,
+    settings: base.SearchSettings,
     rng: np.random.Generator,
     share: tuple[int, int],
-) -> Iterator[tuple[Step, Candidate | None]]:
+) -> Iterator[tuple[base.Step, Candidate | None]]:
     """Search for needle paths from deployments, the least lower bound of the cost first, pass after pass.
 
     A pass ends where the lower bound reaches the cost of the best candidate.  Each run is an iteration, and
     so is the end of a pass.  The candidate is where a local search may begin; the step has it only if there
     is no plan yet.  `share` is the number of this process, and how many share the deployments.
     """
-    nothing = Step(iteration=0, phase=PHASE)
+    nothing = base.Step(iteration=0, phase=PHASE)
     if not len(arcs.in_workspace):
         return
     number, parts = share
     by_bound, bounds = arcs.by_bound
-    ordered = different(arcs.atlas.deployments, by_bound)[number::parts]
+    ordered = base.different(arcs.atlas.deployments, by_bound)[number::parts]
     for level in count():
         iterations = settings.needle_iterations * 2 ** min(level, DOUBLINGS)
         for entry in ordered.tolist():
@@ -112,7 +105,7 @@ def needle_searches(
             limit = 1.3 * incumbent.cost - float(arcs.before(np.array([entry]))[0])
             found = _with_path(arcs, planner, entry, limit, iterations, rng)
             first = found is not None and incumbent.step is None
-            yield evaluated_step(arcs.evaluator, PHASE, found) if first else nothing, found
+            yield base.evaluated_step(arcs.evaluator, PHASE, found) if first else nothing, found
         yield nothing, None
 
 
@@ -174,7 +167,7 @@ def random_placements(task: Task, atlas: Atlas, number: int = 0) -> Iterator[Pla
         )
 
 
-class KuntzSearch(ParallelSearch):
+class KuntzSearch(base.ParallelSearch):
     """Algorithm 1 of [Kuntz2015]: random placement, workspace rejection, RRT, keep the best.
 
     Lines 3-7 draw site, rotation and translations; line 8 rejects placements whose workspace does not hold
@@ -191,12 +184,14 @@ class KuntzSearch(ParallelSearch):
         self._needle_planner = NamedNeedlePlanner(self._evaluator, "rrt")
         super().__init__(self._evaluator.blocked)
 
-    def further_steps(self) -> Iterator[Step]:
+    def further_steps(self) -> Iterator[base.Step]:
         """Draw placements without end; each is an iteration, and none depends on those before it."""
         placements = random_placements(self._task, self._atlas, self.share[0])
         for iteration, placement in enumerate(placements, start=1):
             candidate = self._attempt(placement)
-            yield self.incumbent.improved(evaluated_step(self._evaluator, self.phase, candidate, iteration))
+            yield self.incumbent.improved(
+                base.evaluated_step(self._evaluator, self.phase, candidate, iteration)
+            )
 
     def _attempt(self, placement: Placement) -> Candidate | None:
         """Carry out lines 8 and 9 for a placement."""

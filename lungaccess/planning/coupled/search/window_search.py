@@ -11,6 +11,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.kernels.aimed_tubes import COST
+from lungaccess.planning.coupled.search import base
 from lungaccess.planning.coupled.search.aimed_tubes import (
     AimedTubes,
     TubeAiming,
@@ -20,13 +21,6 @@ from lungaccess.planning.coupled.search.aimed_tubes import (
     near_mm,
 )
 from lungaccess.planning.coupled.search.atlas_search import AtlasSearch
-from lungaccess.planning.coupled.search.base import (
-    ESTIMATE_SLACK,
-    Incumbent,
-    SearchSettings,
-    Step,
-    evaluated_step,
-)
 from lungaccess.planning.coupled.search.direct_arcs import DirectArcs
 from lungaccess.planning.coupled.search.direct_candidates import DirectCandidates
 from lungaccess.plans.assemble import assemble, with_devices
@@ -123,7 +117,7 @@ OUTSIDE_COST = 1e9
 """Cost of a breath without a window: half a percent of it is more than any path costs."""
 VARY_EVERY = 3
 """Steps of the other phases of the search for each variation of the window."""
-_SETTINGS = SearchSettings(kept_slack=100.0)
+_SETTINGS = base.SearchSettings(kept_slack=100.0)
 """The cheapest arcs need not be those that stay clear: nearly all of them may be starts."""
 
 
@@ -246,7 +240,7 @@ class WindowDirectSearch:
     phase = "direct candidates"
 
     def __init__(
-        self, arcs: DirectCandidates, evaluator: WindowEvaluator, shares: Float, incumbent: Incumbent
+        self, arcs: DirectCandidates, evaluator: WindowEvaluator, shares: Float, incumbent: base.Incumbent
     ) -> None:
         self._arcs, self._evaluator = arcs, evaluator
         self.shares, self._incumbent = shares, incumbent
@@ -254,14 +248,14 @@ class WindowDirectSearch:
         self.blockers: Int = np.zeros(0, dtype=np.int64)
         self.refused: dict[int, WindowLimit] = {}
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[base.Step]:
         """Yield a step for all entries together, then one for each clear one that may be the best."""
         near, evaluator = self._arcs.promising, self._evaluator
         self.blockers, costs, _least = self._arcs.evaluate(near, math.inf)
         evaluator.blocked.update(self._arcs.reasons(self.blockers))
-        yield Step(iteration=0, phase=self.phase)
+        yield base.Step(iteration=0, phase=self.phase)
         clear = near[self.blockers == 0]
-        bounds = costs[self.blockers == 0] / ESTIMATE_SLACK
+        bounds = costs[self.blockers == 0] / base.ESTIMATE_SLACK
         if evaluator.widest:
             most = self.shares[self._arcs.atlas.deployments.site[clear]]
             bounds += [cost_outside(share) for share in most.tolist()]
@@ -271,7 +265,7 @@ class WindowDirectSearch:
         for n, entry in enumerate(entries.tolist()):
             if bounds[n] > self._incumbent.cost:
                 break
-            step = evaluated_step(evaluator, self.phase, self._arcs.candidate(entry))
+            step = base.evaluated_step(evaluator, self.phase, self._arcs.candidate(entry))
             if step.candidate is not None:
                 ranks[n] = step.cost
             elif evaluator.limit is not None:
@@ -289,7 +283,7 @@ class WindowSearch(AtlasSearch):
         super().__init__(evaluator.task, atlas, _SETTINGS, arcs)
         self.windows = self.direct = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
-    def _rounds(self) -> Iterator[Step]:
+    def _rounds(self) -> Iterator[base.Step]:
         varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
         for number, step in enumerate(super()._rounds()):
             yield step
@@ -306,12 +300,12 @@ class WindowTubeSearch(TubeSearch):
         super().__init__(evaluator.task, atlas, arcs)
         self.windows = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
-    def direct_steps(self) -> Iterator[Step]:
+    def direct_steps(self) -> Iterator[base.Step]:
         """Aim from the tips of the atlas, those first that may be the best."""
         yield from self.windows.steps()
         self.clear = self.windows.clear
 
-    def further_steps(self) -> Iterator[Step]:
+    def further_steps(self) -> Iterator[base.Step]:
         """Look along the motions, then vary the best; each motion and each variation is an iteration."""
         varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
         # Variations with which the search of tubes alone ends, a few seconds: several times from wide to
@@ -333,14 +327,14 @@ def window_search(
     return (WindowTubeSearch if task.system.needle is None else WindowSearch)(evaluator, atlas)
 
 
-def _variations(evaluator: WindowEvaluator, incumbent: Incumbent, number: int) -> Iterator[Step]:
+def _variations(evaluator: WindowEvaluator, incumbent: base.Incumbent, number: int) -> Iterator[base.Step]:
     """Vary deployment and aim of the best candidate, as long as its window is not the whole breath.
 
     The variations of each process, by its number, are others.
     """
     phase, size, task = "variation", 1.0, evaluator.task
     rng = np.random.Generator(np.random.PCG64([task.seed, VARY_EVERY, *([number] if number else [])]))
-    middle, nothing = require_motion(task.lung).masks_phase, Step(iteration=0, phase=phase)
+    middle, nothing = require_motion(task.lung).masks_phase, base.Step(iteration=0, phase=phase)
     while True:
         best = incumbent.candidate
         if best is None or (evaluator.widest and incumbent.cost < OUTSIDE_COST / STEPS):
@@ -353,7 +347,7 @@ def _variations(evaluator: WindowEvaluator, incumbent: Incumbent, number: int) -
         aim = evaluator.moving.aim(best.tip.lps_from_scope_tip[:3, 3], towards)
         before = incumbent.cost
         made = varied(evaluator, best, turn, shifts, np.array(aim.point_lps))
-        step = evaluated_step(evaluator, phase, made)
+        step = base.evaluated_step(evaluator, phase, made)
         yield step
         better = step.cost < before
         # Variations become smaller with every one that fails, and are wide again when one succeeds.

@@ -1,5 +1,6 @@
 """Plan a tour of the airway to several lesions of one patient."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -218,15 +219,12 @@ def _points_of_arcs(atlas: Atlas, target: Target) -> frozenset[int]:
     direct = direct_candidates(task, atlas)
     clear = direct.clear()
     points = atlas.motions.tree_point[atlas.deployments.site[clear]]
-    good: set[int] = set()
-    tried: dict[int, int] = {}
+    good, tried = set[int](), Counter[int]()
     for entry, point in zip(clear.tolist(), points.tolist(), strict=True):
         # How many deployments of a site are tried in full before the site counts as refused.
-        if point in good or tried.get(point, 0) >= 3:
-            continue
-        tried[point] = tried.get(point, 0) + 1
-        if direct.proved(entry) is not None:
-            good.add(int(point))
+        if point not in good and tried[point] < 3:
+            tried[point] += 1
+            good |= set() if direct.proved(entry) is None else {point}
     return frozenset(good)
 
 

@@ -58,18 +58,19 @@ class Atlas:
 
 def require_same(atlas: Atlas, lung: Lung, system: System) -> None:
     """Raise SettingsError unless an atlas holds for a lung and a system, whatever the needle does."""
-    made, wanted = atlas.system, system
-    same = (
-        atlas.lung.key == lung.key
-        and (made.scope, made.tubes, made.margins) == (wanted.scope, wanted.tubes, wanted.margins)
-        and atlas.with_fissures == fissures_are_obstacles(lung, wanted)
-    )
-    if not same:
+    if atlas.lung.key != lung.key or not _is_of_devices(atlas, lung, system):
         raise SettingsError(
-            f"The atlas was made for {atlas.lung.name} and {made.name}",
-            expected=f"one for {lung.name} and {wanted.name}, with the same masks, scope, tubes and margins",
+            f"The atlas was made for {atlas.lung.name} and {atlas.system.name}",
+            expected=f"one for {lung.name} and {system.name}, with the same masks, scope, tubes and margins",
             remedy="Make it with build_atlas(lung, system)",
         )
+
+
+def _is_of_devices(atlas: Atlas, lung: Lung, system: System) -> bool:
+    """Tell whether an atlas was made for the devices of a system, and what is an obstacle for them."""
+    made = atlas.system
+    same = (made.scope, made.tubes, made.margins) == (system.scope, system.tubes, system.margins)
+    return same and atlas.with_fissures == fissures_are_obstacles(lung, system)
 
 
 def atlas_part(atlas: Atlas, entries: Int) -> Atlas:
@@ -242,18 +243,13 @@ def _depends_on(lung: Lung, system: System, **grid: Unpack[AtlasGrid]) -> dict[s
 
 def _has_same_airway(before: Atlas, lung: Lung, system: System) -> bool:
     """Tell whether airways and pleura are those of an atlas that was made for the same devices."""
-    old, made = before.lung, before.system
-    settings = (made.scope, made.tubes, made.margins) == (system.scope, system.tubes, system.margins)
-    fits = settings and before.with_fissures == fissures_are_obstacles(lung, system)
-    fits = fits and old.grid.shape == lung.grid.shape
-    if not (fits and np.array_equal(old.grid.lps_from_ijk, lung.grid.lps_from_ijk)):
-        return False
-    airway = ~np.uint16(VESSEL | FISSURE)
-    depths = old.lumen_depth, lung.lumen_depth
+    old, airway = before.lung, ~np.uint16(VESSEL | FISSURE)
     return (
-        np.array_equal(old.labels & airway, lung.labels & airway)
-        and np.array_equal(depths[0].corners, depths[1].corners)
-        and np.array_equal(depths[0].geometry, depths[1].geometry)
+        _is_of_devices(before, lung, system)
+        and np.array_equal(old.grid.lps_from_ijk, lung.grid.lps_from_ijk)
+        and np.array_equal(old.labels & airway, lung.labels & airway)
+        and np.array_equal(old.lumen_depth.corners, lung.lumen_depth.corners)
+        and np.array_equal(old.lumen_depth.geometry, lung.lumen_depth.geometry)
     )
 
 

@@ -256,21 +256,29 @@ WALL_MM = 3.0
 
 
 @frozen_record
-class NeedleAnswer(PathSearch):
-    """What a planner found, and what it was asked; planners of OMPL look at no objective.
+class NeedleQuestion:
+    """A start and a target in a lung as the needle stage takes them.
 
     Args:
         branches: Branches whose wall the start is taken to have pierced, the nearest first; none if no airway
             is near.
         at_wall: Whether the needle begins so near to the lumen that it pierces the wall itself.
-        lobe: Where what stands in the way lies; "" if the lobes are not known.
     """
 
-    branches: tuple[int, ...]
-    at_wall: bool
-    lobe: str
     environment: NeedleEnvironment
     query: Query
+    branches: tuple[int, ...]
+    at_wall: bool
+
+
+@frozen_record
+class NeedleAnswer(PathSearch, NeedleQuestion):
+    """What a planner found, and what it was asked; planners of OMPL look at no objective.
+
+    `lobe` is where what stands in the way lies; "" if the lobes are not known.
+    """
+
+    lobe: str
     objective: Objective
 
     @property
@@ -377,16 +385,6 @@ def plan_needle(
     )
 
 
-@frozen_record
-class NeedleQuestion:
-    """A start and a target in a lung as the needle stage takes them; see `NeedleAnswer`."""
-
-    environment: NeedleEnvironment
-    query: Query
-    branches: tuple[int, ...]
-    at_wall: bool
-
-
 def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
     """Ask for a path of a system's needle, with its margins, and the exemption that its start `(4, 4)` has.
 
@@ -432,12 +430,9 @@ def pierced_branches(lung: Organ, point: Float, near_mm: float) -> tuple[int, ..
 
 def _meeting(lung: Lung, branch: int) -> set[int]:
     """Return the parent, the children, and the other children of the parent of a branch."""
-    tree = lung.tree
-    parent = int(tree.branch_parent[branch])
-    joined = {int(b) for b in tree.children(branch)}
-    if parent >= 0:
-        joined |= {parent, *(int(b) for b in tree.children(parent))}
-    return joined - {branch}
+    parent = int(lung.tree.branch_parent[branch])
+    of_parent = [] if parent < 0 else [parent, *lung.tree.children(parent)]
+    return {int(b) for b in (*lung.tree.children(branch), *of_parent)} - {branch}
 
 
 def _is_near(lung: Organ, point: Float, branch: int, near_mm: float) -> bool:

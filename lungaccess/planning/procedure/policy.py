@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from anatomy.base.errors import SettingsError, TargetError
 from anatomy.base.records import frozen_record
@@ -355,15 +356,16 @@ class Policy:
         return replace(chosen, tips=tips, found=found, chances=chances, arcs=arcs, changed=changed)
 
     def _paths(
-        self, arcs: Float, counts: Int, tips: Float, branches: Int, targets: Float
+        self, arcs: Float, counts: Int, *where: ArrayLike, about: tuple[kernel.Scene, object] | None = None
     ) -> tuple[Int, Float, Float]:
-        """Return what `choose_needles` finds: its numbers, chances, and arcs."""
-        found, chances = np.zeros((len(tips), 3), dtype=np.int64), np.zeros(len(tips))
+        """Return what `choose_needles` finds from tips, branches and targets: numbers, chances, and arcs.
+
+        `about` are scene and sizes, by default those of a needle that is still in the tubes.
+        """
+        found, chances = np.zeros((len(counts), 3), dtype=np.int64), np.zeros(len(counts))
         found[:, 1], arcs = counts, np.array(arcs)
-        kernel.choose_needles(
-            self._scene, self._left, np.ascontiguousarray(tips), branches, np.ascontiguousarray(targets),
-            ASIDES, found, chances, arcs,
-        )  # fmt: skip
+        places = (np.array(each, order="C") for each in where)
+        kernel.choose_needles(*(about or (self._scene, self._left)), *places, ASIDES, found, chances, arcs)
         return found, chances, arcs
 
     def _searched(self, tip: Float, target: Float) -> Float | None:
@@ -401,13 +403,10 @@ class Policy:
             tip_known=True, tip=steering.position_mm, tip_turn=math.radians(steering.direction_deg),
             exempt=left.exempt_mm,
         )  # fmt: skip
-        found, chances = np.array([[0, count, 0]]), np.zeros(1)
         arcs = np.zeros((1, max(LONGEST, count), 3))
         arcs[0, :count] = way.rest
-        kernel.choose_needles(
-            self._scene._replace(limits=left), known, np.array(lps_from_tip)[None], np.array([way.branch]),
-            np.array(target)[None], ASIDES, found, chances, arcs,
-        )  # fmt: skip
+        where, about = (lps_from_tip[None], [way.branch], target[None]), self._scene._replace(limits=left)
+        found, chances, arcs = self._paths(arcs, np.array([count]), *where, about=(about, known))
         return arcs[0, : found[0, 1]], float(chances[0]), bool(found[0, 2])
 
     # One answer -----------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import time
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, Unpack
 
 import numba
 import numpy as np
@@ -24,7 +24,7 @@ from anatomy.base.child_process import end_with_parent
 from anatomy.base.errors import AnatomyError, LungaccessError, PlanFileError, SettingsError, TargetError
 from anatomy.lung import Lung
 from lungaccess.judging.checking import Checker
-from lungaccess.planning.coupled.atlas import Atlas, open_atlas
+from lungaccess.planning.coupled.atlas import Atlas, AtlasGrid, open_atlas
 from lungaccess.planning.one_stage import plan_needle
 from lungaccess.planning.one_system import run as plan
 from lungaccess.planning.success.estimate import FRESH_SEED, chance_of, estimate_success
@@ -175,15 +175,13 @@ def _opened(patient: runs.Patient, cache: Path | None) -> Opened:
 
 
 def _atlas_of(problem: runs.Problem, cache: Path | None) -> Atlas:
-    spacing = (problem.rotations, problem.stop_spacing_mm, problem.site_spacing_mm)
-    return _atlas(problem.patient, problem.system, cache, *spacing)
+    grid = {name: getattr(problem, name) for name in AtlasGrid.__annotations__}
+    return _atlas(problem.patient, problem.system, cache, **grid)
 
 
 @lru_cache(maxsize=KEPT_PATIENTS)
-def _atlas(patient: runs.Patient, system: System, cache: Path | None, *spacing: Any) -> Atlas:
-    names = ("rotations", "stop_spacing_mm", "site_spacing_mm")
-    lung = _opened(patient, cache).lung
-    return open_atlas(lung, system, cache=cache, **dict(zip(names, spacing, strict=True)))
+def _atlas(patient: runs.Patient, system: System, cache: Path | None, **grid: Unpack[AtlasGrid]) -> Atlas:
+    return open_atlas(_opened(patient, cache).lung, system, cache=cache, **grid)
 
 
 def _in_own_process(run: runs.Run, cache: Path | None) -> runs.Answer:

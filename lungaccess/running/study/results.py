@@ -130,7 +130,7 @@ class ResultsFile:
                 (run.key,),
             )
             experiment, planner = self._experiment(run.problem), self._planner(run)
-            made = connection.execute(*run_row(run, answer, experiment, planner))
+            made = self._insert("runs", run_row(run, answer, experiment, planner), "INSERT OR IGNORE")
             if made.rowcount == 0:
                 return False
             connection.execute(KERNELS_TABLE)
@@ -161,10 +161,14 @@ class ResultsFile:
         ).fetchone()
         if known:
             return int(known[0])
-        made = self._connection.execute(*experiment_row(problem))
-        number = int(made.lastrowid or 0)
-        self._connection.execute(*problem_row(problem, number))
+        number = int(self._insert("experiments", experiment_row(problem)).lastrowid or 0)
+        self._insert("problems", problem_row(problem, number))
         return number
+
+    def _insert(self, table: str, row: dict[str, Any], how: str = "INSERT") -> sqlite3.Cursor:
+        """Store a row of a table, given by the names of its columns."""
+        words = f"{how} INTO {table} ({', '.join(row)}) VALUES ({', '.join('?' * len(row))})"
+        return self._connection.execute(words, tuple(row.values()))
 
     def _planner(self, run: Run) -> int:
         settings = to_mapping(run.planner)
@@ -289,18 +293,10 @@ COMMIT;
 COST_COLUMNS = {term.key: term.key for term in TERMS if not term.of_all} | {"length_mm": "solution_length"}
 """The column of each cost of the needle; OMPL's benchmarks have one for the length."""
 
-Statement = tuple[str, tuple[Any, ...]]
-"""SQL and its values."""
 
-
-def _insert(table: str, row: dict[str, Any], how: str = "INSERT") -> Statement:
-    places = ", ".join("?" * len(row))
-    return f"{how} INTO {table} ({', '.join(row)}) VALUES ({places})", tuple(row.values())
-
-
-def experiment_row(problem: Problem) -> Statement:
-    """Return what stores a problem in the table of OMPL's benchmarks."""
-    row = {
+def experiment_row(problem: Problem) -> dict[str, Any]:
+    """Return a problem as a row in the table of OMPL's benchmarks."""
+    return {
         "name": problem.case,
         "totaltime": 0.0,
         "timelimit": problem.time_s or 0.0,
@@ -312,13 +308,13 @@ def experiment_row(problem: Problem) -> Statement:
         "target": problem.target,
         "start": problem.start,
     }
-    return _insert("experiments", row)
 
 
-def problem_row(problem: Problem, experiment: int) -> Statement:
-    """Return what stores the rest of a problem."""
+def problem_row(problem: Problem, experiment: int) -> dict[str, Any]:
+    """Return the rest of a problem as a row."""
     x, y, z = problem.target_lps
-    row = {
+    same = ("objective", "target", "origin", "start", "iterations", "time_s")
+    return {
         "experimentid": experiment,
         "key": problem.key,
         "case_name": problem.case,
@@ -329,15 +325,14 @@ def problem_row(problem: Problem, experiment: int) -> Statement:
         "x_lps_mm": x,
         "y_lps_mm": y,
         "z_lps_mm": z,
+        **{name: getattr(problem, name) for name in same},
     }
-    same = ("objective", "target", "origin", "start", "iterations", "time_s")
-    return _insert("problems", row | {name: getattr(problem, name) for name in same})
 
 
-def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> Statement:
-    """Return what stores a run, unless one of the same key is there."""
+def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str, Any]:
+    """Return a run as a row."""
     first = answer.improvements[0].time_s if answer.improvements else None
-    row = {
+    return {
         "experimentid": experiment,
         "plannerid": planner,
         "time": answer.time_s,
@@ -354,7 +349,6 @@ def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> Statemen
         **{column: answer.costs.get(key) for key, column in COST_COLUMNS.items()},
         "key": run.key,
     }
-    return _insert("runs", row, "INSERT OR IGNORE")
 
 
 def add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:

@@ -133,8 +133,7 @@ def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNe
     step = max(int(5.0 / np.linalg.norm(needle[1] - needle[0])), 1)
     tubes, target = plan.needle.lps_from_start[:3, 3], np.asarray(plan.target_lps)[None]
     ahead, breath = plan.needle.lps_from_start[:3, 2], np.linspace(0.0, 1.0, PHASES)
-    worst = np.array([0.0, 0.0, 0.0, np.inf])
-    factor = 1.0
+    seen = []
     for begin, end in window.phases:
         for inserted in np.linspace(begin, end, PHASES // 4):
             tissue = moving.pulled_back(moving.carried(needle, inserted), inserted)
@@ -146,18 +145,15 @@ def carried_needle(plan: Plan, lung: Lung, window: BreathingWindow) -> CarriedNe
                 a = curve[min(step, len(curve) - 1)] - curve[0]
                 b = pose[:3, :3] @ ahead
                 bend = float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
-                radius = _least_radius_mm(curve[::step])
-                seen = np.array([np.linalg.norm(miss), np.linalg.norm(away), bend])
-                worst[:3] = np.maximum(worst[:3], seen)
-                worst[3] = min(worst[3], radius)
-                now = _length(curve) / length
-                factor = now if abs(now - 1.0) > abs(factor - 1.0) else factor
+                shifts = np.linalg.norm(miss), np.linalg.norm(away)
+                seen.append((*shifts, bend, _least_radius_mm(curve[::step]), _length(curve) / length))
+    misses, shifted, bent, radii, factors = np.array(seen).T
     return CarriedNeedle(
-        end_miss_mm=float(worst[0]),
-        shift_at_tubes_mm=float(worst[1]),
-        bend_at_tubes_deg=float(worst[2]),
-        least_radius_mm=float(worst[3]),
-        length_factor=float(factor),
+        end_miss_mm=float(misses.max()),
+        shift_at_tubes_mm=float(shifted.max()),
+        bend_at_tubes_deg=float(bent.max()),
+        least_radius_mm=float(radii.min()),
+        length_factor=float(factors[np.abs(factors - 1.0).argmax()]),
     )
 
 

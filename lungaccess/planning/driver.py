@@ -43,10 +43,7 @@ def place_of(plan: Plan, place: StatedPlace) -> Float:
 
 
 def place_part(request: Request, atlas: Atlas) -> Atlas:
-    """Return the part of an atlas whose deployments go through the stated place, all of it without one.
-
-    TargetError is raised if there is none: says how far the nearest one is.
-    """
+    """Return the part of an atlas that goes through the stated place; TargetError says how far any is."""
     place = request.place
     if place is None:
         return atlas

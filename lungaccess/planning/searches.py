@@ -114,10 +114,7 @@ def planners() -> dict[str, SearchFactory]:
 
 
 def register_planner(name: str, search: SearchFactory) -> None:
-    """Make a search known by its name in this process; a package does so by an entry point.
-
-    SettingsError is raised if the name is that of a search of this package.
-    """
+    """Make a search known by its name in this process; SettingsError if this package has one of that name."""
     if name in (ATLAS, *NEED_A_NEEDLE):
         raise SettingsError(f"A planner cannot be called {name!r}", expected="a name of its own")
     _OWN[name] = search

@@ -94,10 +94,7 @@ def read_lesions(path: str | Path) -> Float:
 
 
 def lesions_of(lung: Lung) -> Float:
-    """Return the targets that came with a patient, `(M, 3)` LPS mm.
-
-    TargetError is raised if none came with it, or more than 62.
-    """
+    """Return a patient's targets, `(M, 3)` LPS mm; TargetError if none came with it, or more than 62."""
     count = len(lung.targets_lps)
     if not 1 <= count <= MOST_LESIONS:
         raise TargetError(

@@ -386,10 +386,7 @@ def plan_needle(
 
 
 def needle_question(lung: Organ, system: System, lps_from_start: Float, target_lps: Float) -> NeedleQuestion:
-    """Ask for a path of a system's needle, with its margins, and the exemption that its start `(4, 4)` has.
-
-    TargetError is raised if the target (LPS mm) is the point of the start.
-    """
+    """Ask for a path of a needle, its start `(4, 4)` with its exemption; TargetError if it starts there."""
     # The searches take no shorter arc.
     if np.linalg.norm(lps_from_start[:3, 3] - target_lps) < 1e-6:
         raise TargetError(

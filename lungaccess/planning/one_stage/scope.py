@@ -103,10 +103,7 @@ def advise_scope(
 
 
 def save_advice(advice: ScopeAdvice, folder: Path) -> None:
-    """Write the advice, and the camera's flight as a curve for 3D Slicer, into a folder.
-
-    FileError is raised if the folder is missing or not writable.
-    """
+    """Write the advice, and the camera's flight for 3D Slicer, into a folder; FileError if it cannot be."""
     contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
     for name, content in contents.items():
         write_text(folder / name, json.dumps(content, indent=1))

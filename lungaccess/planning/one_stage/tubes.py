@@ -105,10 +105,7 @@ class TubeAnswer:
 
 
 def load_tubes(name_or_path: str | os.PathLike[str]) -> System | BareTubes:
-    """Read a system, or a TOML file that holds just a name and tables `[[tubes]]`, the innermost first.
-
-    Errors are those of `lungaccess.problem.system.load_system`.
-    """
+    """Read a system, as `load_system`, or a TOML file of a name and `[[tubes]]`, the innermost first."""
     given = os.fspath(name_or_path)
     if given.endswith(".toml"):
         mapping = read_toml(given, remedy=_REMEDY)
@@ -254,10 +251,7 @@ def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
 
 
 def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
-    """Return the shapes of a design, from the cache if they are there; bare tubes have default limits.
-
-    Errors are those of `stages.tube.open_shapes`.
-    """
+    """Return the shapes of a design, of bare tubes by default limits; cache and errors: `open_shapes`."""
     limits, needle = ShapeLimits(), None
     if isinstance(device, System):
         stated = device.tubes
@@ -299,10 +293,7 @@ def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
 
 
 def save_shapes(shapes: TubeShapes, path: Path) -> None:
-    """Write a table of all shapes as CSV: insertions and rotations from the innermost tube, tip, and costs.
-
-    FileError is raised if the file cannot be written.
-    """
+    """Write all shapes as CSV, the innermost tube first, with tip and costs; FileError if it cannot be."""
     n = len(shapes.tubes)
     columns = {
         **{f"insertion_{i + 1}_mm": shapes.insertions_mm[:, i] for i in range(n)},

@@ -196,10 +196,7 @@ class ReachMap:
 
 
 def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
-    """Return the grid of cubes of `spacing_mm` along the axes of a lung's grid that covers it.
-
-    SettingsError is raised if the spacing is not between 0.5 and 50 mm.
-    """
+    """Return the grid of cubes along a lung's axes that covers it; SettingsError unless of 0.5 to 50 mm."""
     if not 0.5 <= spacing_mm <= 50.0:
         raise SettingsError(
             f"The spacing of the map is {spacing_mm} mm",

@@ -82,10 +82,7 @@ def why_no_query(patient: PatientImages | LiverImages | Organ) -> str:
 
 
 def patients_of(folder: Path) -> list[Path]:
-    """Return the patients that a folder holds, or itself if it is one, in the order of their numbers.
-
-    FileError is raised if the folder is not there, or is no patient and holds none.
-    """
+    """Return the patients of a folder by their numbers, or itself if it is one; FileError without any."""
     from anatomy.io.images import image_suffix
 
     if not folder.is_dir():
@@ -197,10 +194,7 @@ class PeerResult:
 
 
 def read_peer(path: Path) -> Mapping[Key, PeerResult]:
-    """Read recorded results: runs of one thread that ignore obstacles within 3 mm of the start.
-
-    FileError is raised if the file cannot be read or holds something else.
-    """
+    """Read recorded runs of one thread that ignore obstacles 3 mm about the start; FileError without any."""
     try:
         runs = json.loads(path.read_text(encoding="utf-8"))["runs"]
         found: dict[Key, dict[str, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))

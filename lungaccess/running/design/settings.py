@@ -117,10 +117,7 @@ def read_design(path: str | os.PathLike[str]) -> Design:
 
 
 def design_of(content: Mapping[str, Any], where: str = "design", folder: str = ".") -> Design:
-    """Return the search that plain values describe: those of a study, and a table `design`.
-
-    SettingsError is raised if a key is unknown, missing or wrong.
-    """
+    """Return the search of plain values: a study and a table `design`; SettingsError if a key is wrong."""
     values = {"planner": [{"name": "atlas"}], **content}
     own = values.pop("design", None)
     if not isinstance(own, Mapping) or not isinstance(own.get("vary"), Mapping):
@@ -167,10 +164,7 @@ def near(system: System, numbers: Sequence[Number], even: Sequence[float], radiu
 
 
 def device(base: System, numbers: Sequence[Number], point: Sequence[float]) -> System:
-    """Return the system at a point of the cube, named by what it changes, which its sources call assumed.
-
-    SettingsError is raised if the validator of devices refuses it.
-    """
+    """Return the system at a point of the cube, named by what it changes; SettingsError if it is refused."""
     changes: dict[str, Any] = {}
     for number, x in zip(numbers, point, strict=True):
         if number.range is None:

@@ -47,11 +47,8 @@ class Patient:
         return lung_key(dict(self.sources))
 
 
-def patient_of(case: Case, folder: Path, cache: Path | None = None) -> Patient:
-    """Return the patient of a case; a relative folder is relative to `folder`.
-
-    LungaccessError is raised if the patient cannot be read.
-    """
+def patient_of(case: Case, folder: Path) -> Patient:
+    """Return the patient of a case, whose folder may lie in `folder`; LungaccessError if it is unreadable."""
     from anatomy.io.inputs import input_hashes
 
     made = case.phantom
@@ -203,7 +200,7 @@ def runs_of(
     for case in study.case:
         (progress or (lambda _words: None))(f"targets of {case.name}")
         folder = Path(study.folder)
-        patient = patient_of(case, folder, cache)
+        patient = patient_of(case, folder)
         system = load_system(beside(case.system, folder), fissures_allowed=case.fissures_allowed)
         counted: dict[str, Any] = {}
         if case.errors:

@@ -220,10 +220,7 @@ def read_study(path: str | os.PathLike[str]) -> Study:
 
 
 def study_of(content: Mapping[str, Any], where: str = "study", folder: str = ".") -> Study:
-    """Return the study that plain values describe, as those of a TOML file.
-
-    SettingsError is raised if a key is unknown, missing or wrong.
-    """
+    """Return the study that plain values describe, as of a TOML file; SettingsError if a key is wrong."""
     values = dict(content)
     if "folder" in values:
         raise SettingsError(

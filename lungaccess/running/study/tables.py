@@ -131,10 +131,7 @@ def _short(row: tuple[Any, ...]) -> str:
 
 
 def export_csv(path: Path, folder: Path) -> list[Path]:
-    """Write the tables of a results file as CSV with a heading, numbers without loss; return the files.
-
-    FileError is raised if the results cannot be read or the folder cannot be written.
-    """
+    """Write the tables as CSV with headings, numbers without loss; return the files; FileError if not."""
     return _export(path, folder, ".csv", _write_csv)
 
 
@@ -157,10 +154,7 @@ def _write_csv(content: Table, path: Path) -> None:
 
 
 def export_parquet(path: Path, folder: Path) -> list[Path]:
-    """Write the tables of a results file as Parquet; parameters and errors as those of `export_csv`.
-
-    StudyError is raised if pyarrow is not installed.
-    """
+    """Write the tables of a results file as Parquet, as `export_csv` does; StudyError without pyarrow."""
     try:
         import pyarrow.parquet  # noqa: F401
     except ImportError as error:

@@ -174,11 +174,7 @@ def unproved_phantom(case: BenchmarkPhantom) -> Phantom:
 
 
 def make_benchmark_phantom(case: BenchmarkPhantom) -> Phantom:
-    """Make a phantom of the benchmark.
-
-    AnatomyError is raised if its masks are not those of the manifest: the generator, or a library below it,
-    has changed.
-    """
+    """Make a phantom; AnatomyError if another generator, or library below it, makes other masks."""
     made = unproved_phantom(case)
     remedy = "Install the versions that constraints.txt names; a changed generator needs a new version"
     require_masks(case.name, made.images, f"of {case.name} made here", remedy)
@@ -287,10 +283,7 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
 
 
 def require_cases(folder: Path) -> tuple[BenchmarkPhantom, ...]:
-    """Return the phantoms that a folder holds.
-
-    FileError is raised if it is no folder of this benchmark, or of one with other phantoms.
-    """
+    """Return the phantoms that a folder holds; FileError if it is none of this benchmark as it is now."""
     remedy = f"Make it with: lungaccess benchmark {VERSION} make --out {folder}"
     content = read_json(folder / BENCHMARK, expected="what `make` wrote", remedy=remedy)
     stated = content.get("manifest_sha256") if isinstance(content, dict) else None

@@ -195,10 +195,7 @@ class _Scorer:
 
 
 def _own_masks(name: str, folder: Path, cache: Path | None) -> Lung:
-    """Return the lung of a phantom, whose masks are those of the manifest.
-
-    AnatomyError is raised if they are not: answers about other masks count for nothing.
-    """
+    """Return the lung of a phantom; AnatomyError if its masks, which answers are about, are others."""
     from anatomy.io.patients import load_patient as read_images
 
     remedy = "Delete the folder of this phantom and make it again"
@@ -342,10 +339,7 @@ def _write_rows(name: str, cls: type, rows: Iterable[Any], path: Path) -> None:
 
 
 def read_scores(path: Path) -> list[Score]:
-    """Read scores that `write_scores` wrote as JSON.
-
-    FileError is raised if the file cannot be read, holds something else, or is of another benchmark.
-    """
+    """Read scores that `write_scores` wrote as JSON; FileError without any, or of another benchmark."""
     expected, remedy = (
         "scores in JSON",
         f"Write them with: lungaccess benchmark {cases.VERSION} score ... --out scores.json",

@@ -298,10 +298,7 @@ WHERE NOT o.failed ORDER BY r.id"""
 
 
 def method_choice(words: str, iterations: int | None) -> PlannerChoice:
-    """Return the planner of a study that words name: METHOD, or METHOD+NEEDLE_PLANNER.
-
-    SettingsError is raised if there is no such method or planner of the needle.
-    """
+    """Return the planner that METHOD or METHOD+NEEDLE_PLANNER names; SettingsError if there is none."""
     method, _joint, needle = words.partition(JOINT)
     return PlannerChoice(
         name=words, method=method, needle_planner=needle, iterations=iterations, without_counterfactuals=True

@@ -16,7 +16,7 @@ from anatomy.lung import Lung
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, ROTATION
 from lungaccess.planning.reachability.kernels.blocked import ProofEnvironment, deep_enough
 from lungaccess.planning.reachability.kernels.deployment_boxes import BOX_COLUMNS, EAST, NORTH, PLACE_X
-from lungaccess.planning.reachability.kernels.unreachable import Pieces, divide, measures
+from lungaccess.planning.reachability.kernels.unreachable import Pieces, divide
 from lungaccess.planning.reachability.layers import THREADS
 from stages.scope import MAX_OFF_AXIS_MM, MAX_TURN_AT_TIP_RAD
 from stages.tube.kernels import CURVED_LENGTH
@@ -236,6 +236,4 @@ def _first_boxes(tubes: Float, longest: float, pieces: Sequence[PlacePiece]) -> 
 
 
 def _measures(boxes: Float) -> Float:
-    found = np.zeros(len(boxes))
-    measures(boxes, found)
-    return found
+    return np.asarray(np.prod(2.0 * boxes[:, HALF:], axis=1))

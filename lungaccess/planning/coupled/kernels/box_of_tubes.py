@@ -9,13 +9,7 @@ import math
 from typing import NamedTuple
 
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
-from stages.tube.kernels import (
-    CURVED_LENGTH,
-    INNER_CURVATURE,
-    OVERLAP_CURVATURE,
-    insertions_exist,
-    planar_point,
-)
+from stages.tube import kernels
 
 Vector = tuple[float, float, float]
 
@@ -132,15 +126,15 @@ def split(box, other, side):
 def has_insertions(tubes, insertions, box):
     """Tell whether a box holds insertions that are possible and sweep little."""
     outer, inner = box[OUTER], box[INNER]
-    return insertions_exist(tubes, insertions, outer, box[HALF + OUTER], inner, box[HALF + INNER])
+    return kernels.insertions_exist(tubes, insertions, outer, box[HALF + OUTER], inner, box[HALF + INNER])
 
 
 @inner_kernel
 def tubes_of(tubes, base, forward, normal, place, tilt, box):
     """Return the tubes of a box whose scope tips are within `place` (mm) and `tilt` (rad) of one."""
-    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
+    most = max(abs(tubes[kernels.INNER_CURVATURE]), abs(tubes[kernels.OVERLAP_CURVATURE]))
     longest = box[INNER] + box[HALF + INNER]
-    bent = longest > tubes[CURVED_LENGTH]
+    bent = longest > tubes[kernels.CURVED_LENGTH]
     return BoxTubes(
         base,
         forward,
@@ -148,7 +142,7 @@ def tubes_of(tubes, base, forward, normal, place, tilt, box):
         place,
         tilt,
         box[HALF + ROTATION],
-        abs(tubes[OVERLAP_CURVATURE] - tubes[INNER_CURVATURE]) * box[HALF + OUTER],
+        abs(tubes[kernels.OVERLAP_CURVATURE] - tubes[kernels.INNER_CURVATURE]) * box[HALF + OUTER],
         max(box[OUTER] - box[HALF + OUTER], 0.0),
         most * box[HALF + INNER] if bent else 0.0,
         box[OUTER],
@@ -159,7 +153,7 @@ def tubes_of(tubes, base, forward, normal, place, tilt, box):
 @inner_kernel
 def sample_of(tubes, family, s):
     """Return the middle tubes' point at arc length `s`, LPS mm, and how far from it those of others are."""
-    x, z = planar_point(tubes, family.outer, family.inner, s)
+    x, z = kernels.planar_point(tubes, family.outer, family.inner, s)
     wrong = family.sharing * max(s - family.first_outer, 0.0) + family.opening * s
     away = family.place + wrong + family.tilt * (math.hypot(x, z) + wrong) + family.roll * (abs(x) + wrong)
     return minus(minus(family.base, family.normal, -x), family.forward, -z), away
@@ -174,9 +168,9 @@ def tip_of(tubes, family, box):
     """
     tip, away = sample_of(tubes, family, box[INNER])
     inner, half_inner = box[INNER], box[HALF + INNER]
-    straight = max(inner - tubes[CURVED_LENGTH], 0.0)
+    straight = max(inner - tubes[kernels.CURVED_LENGTH], 0.0)
     shared = min(max(box[OUTER] - straight, 0.0), inner - straight)
-    shared_curvature, own_curvature = tubes[OVERLAP_CURVATURE], tubes[INNER_CURVATURE]
+    shared_curvature, own_curvature = tubes[kernels.OVERLAP_CURVATURE], tubes[kernels.INNER_CURVATURE]
     angle = shared_curvature * shared + own_curvature * (inner - straight - shared)
     sine, cosine = math.sin(angle), math.cos(angle)
     tangent = minus(times(family.normal, sine), family.forward, -cosine)
@@ -189,7 +183,7 @@ def tip_of(tubes, family, box):
 @inner_kernel
 def tip_moves(tubes, family, box):
     """Return by how much rotation, outer and inner insertion move the tip, by and large, mm."""
-    x, _z = planar_point(tubes, box[OUTER], box[INNER], box[INNER])
+    x, _z = kernels.planar_point(tubes, box[OUTER], box[INNER], box[INNER])
     by_outer = family.sharing * max(box[INNER] - family.first_outer, 0.0)
     return family.roll * abs(x), by_outer, box[HALF + INNER] + family.opening * box[INNER]
 
@@ -206,12 +200,12 @@ def _shape_of(tubes, box):
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
     if outer > inner:
         return MIXED
-    if inner + half_inner <= tubes[CURVED_LENGTH]:
+    if inner + half_inner <= tubes[kernels.CURVED_LENGTH]:
         return BENT_THROUGHOUT
-    if inner - half_inner >= tubes[CURVED_LENGTH]:
-        if outer - half_outer >= inner + half_inner - tubes[CURVED_LENGTH]:
+    if inner - half_inner >= tubes[kernels.CURVED_LENGTH]:
+        if outer - half_outer >= inner + half_inner - tubes[kernels.CURVED_LENGTH]:
             return STRAIGHT_FIRST
-        if outer + half_outer <= inner - half_inner - tubes[CURVED_LENGTH]:
+        if outer + half_outer <= inner - half_inner - tubes[kernels.CURVED_LENGTH]:
             return OUTER_STRAIGHT
     return MIXED
 
@@ -247,12 +241,12 @@ def seen_target(tubes, kappa, target, family, tip, tangent, box):
     """
     outer, inner = box[OUTER], box[INNER]
     half_outer, half_inner = box[HALF + OUTER], box[HALF + INNER]
-    bent = tubes[INNER_CURVATURE]
-    unlike = tubes[OVERLAP_CURVATURE] - bent
+    bent = tubes[kernels.INNER_CURVATURE]
+    unlike = tubes[kernels.OVERLAP_CURVATURE] - bent
     forward, normal = family.forward, family.normal
     binormal = cross(forward, normal)
-    joint = min(max(outer, inner - tubes[CURVED_LENGTH], 0.0), inner)
-    joint_x, joint_z = planar_point(tubes, outer, inner, joint)
+    joint = min(max(outer, inner - tubes[kernels.CURVED_LENGTH], 0.0), inner)
+    joint_x, joint_z = kernels.planar_point(tubes, outer, inner, joint)
     from_base, from_tip = minus(target, family.base, 1.0), minus(target, tip, 1.0)
     from_joint = minus(minus(from_base, normal, joint_x), forward, joint_z)
     far = norm(from_base)

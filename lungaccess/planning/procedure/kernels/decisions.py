@@ -95,17 +95,6 @@ def _goal_chance(offset, sums, radius):
 
 
 @inner_kernel
-def _of_tip(sizes, point, base, forward, about, at, ahead):
-    """Return the sums of what errors before the needle do to a point: of its start, or of scope and tubes."""
-    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if sizes.tip_known:
-        arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
-        return spread.tilt(spread.shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
-    sums = spread.of_scope(sizes, nothing, point, base, forward)
-    return spread.of_insertion(sizes, sums, point, at, ahead, about)
-
-
-@inner_kernel
 def _moved(moves, point):
     """Return what an error `(6,)` does to a point, see the module."""
     turned = spread.cross((moves[0], moves[1], moves[2]), point)
@@ -144,7 +133,7 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, ne
     curved = rolls[count]
     spacing = max(arcs[:count, 0].sum() / STATIONS, 1e-6)
     least, done, point = spread.CAP, 0.0, at
-    sums = _of_tip(sizes, at, base, forward, about, at, ahead)
+    sums = spread.of_tip(sizes, at, base, forward, about, at, ahead)
     for a in range(count):
         length, kappa = arcs[a, 0], arcs[a, 2]
         normal = _turned_normal(pose, normal, arcs[a, 1])
@@ -157,7 +146,7 @@ def path_chance(scene, sizes, base, forward, tip, arcs, count, target, rolls, ne
             step = length / steps
             _set_turn(curved, axis, point_on_arc(pose, bend, (k + 0.5) * step), kappa * step)
             point = point_on_arc(pose, bend, (k + 1) * step)
-            sums = _of_tip(sizes, point, base, forward, about, at, ahead)
+            sums = spread.of_tip(sizes, point, base, forward, about, at, ahead)
             sums = spread.add(sums, sizes.curvature, _moved(curved, point))
             for e in range(a + 1):
                 sums = spread.add(sums, sizes.roll, _moved(rolls[e], point))
@@ -239,13 +228,6 @@ def _reach_chance(scene, sizes, base, forward, tip, target):
     sums = spread.of_scope(sizes, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), target, base, forward)
     sums = spread.of_insertion(sizes, sums, target, at, ahead, about)
     return _below(spread.reach_margin(sizes, along, off, normal, sums))
-
-
-@inner_kernel
-def _take(paths, kind, arcs, count):
-    """Copy the path of a kind to where the arcs that are carried out stand."""
-    arcs[:] = 0.0
-    arcs[:count] = paths[kind, :count]
 
 
 @inner_kernel
@@ -478,7 +460,8 @@ def choose_tubes(
         elif scene.with_needle:
             taken = planned.shape[0]
         if scene.with_needle:
-            _take(paths, kind, arcs[n], taken)
+            arcs[n] = 0.0
+            arcs[n, :taken] = paths[kind, :taken]
         found[n, 0], found[n, 1], chances[n] = chosen, taken if scene.with_needle else 0, best
 
 

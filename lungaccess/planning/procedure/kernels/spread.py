@@ -132,6 +132,17 @@ def of_insertion(sizes, sums, point, at, ahead, about):
 
 
 @borrowing_kernel
+def of_tip(sizes, point, base, forward, about, at, ahead):
+    """Return the sums of what errors before the needle do to a point: of its start, or of scope and tubes."""
+    nothing = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if sizes.tip_known:
+        arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
+        return tilt(shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
+    sums = of_scope(sizes, nothing, point, base, forward)
+    return of_insertion(sizes, sums, point, at, ahead, about)
+
+
+@borrowing_kernel
 def clearance_at(around, point, with_airway):
     x, y, z = point
     least = distance_bound(around.vessel, around.geometry, x, y, z)
@@ -231,12 +242,7 @@ def find_spread(around, sizes, tips, positions, tangents, exits, lengths, target
                 at[1] + gone * ahead[1] + bent * normal[1],
                 at[2] + gone * ahead[2] + bent * normal[2],
             )
-            if sizes.tip_known:
-                arm = (point[0] - at[0], point[1] - at[1], point[2] - at[2])
-                sums = tilt(shift(nothing, sizes.tip), sizes.tip_turn, arm, ahead)
-            else:
-                sums = of_scope(sizes, nothing, point, base, forward)
-                sums = of_insertion(sizes, sums, point, at, ahead, about)
+            sums = of_tip(sizes, point, base, forward, about, at, ahead)
             bow = 0.5 * kappa * (share * length) ** 2
             sums = add(add(sums, sizes.curvature * bow, normal), sizes.roll * bow, binormal)
             beyond = math.sqrt(gone * gone + bent * bent) > sizes.exempt

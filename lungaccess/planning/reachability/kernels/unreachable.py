@@ -208,13 +208,6 @@ def _measure(box):
 
 
 @kernel(nogil=True)
-def measures(boxes, out):
-    """Write the measure of each of N boxes to `out` (N,)."""
-    for n in range(len(boxes)):
-        out[n] = _measure(boxes[n])
-
-
-@kernel(nogil=True)
 def divide(environment, tubes, insertions, pieces, boxes, owners, greatest, parts, part_owners):
     """Halve the boxes that are larger than `greatest`, and keep the halves that may hold a deployment.
 

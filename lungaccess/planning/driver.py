@@ -181,8 +181,7 @@ def drive(finder: Finder, request: Request, tell: Callable[[ProgressEvent], None
             )  # fmt: skip
     if best is None:
         raise no_plan_beside(request) if beside else finder.no_plan(iteration)
-    last = finder.last(best, iteration, clock.elapsed_s) or best
-    simplest = with_simplest_motion(last, request.lung)
+    simplest = with_simplest_motion(finder.last(best, iteration, clock.elapsed_s) or best, request.lung)
     if simplest is not best:
         yield replace(simplest, timing={**simplest.timing, "planning_s": clock.elapsed_s})
 

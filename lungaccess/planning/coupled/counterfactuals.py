@@ -139,8 +139,7 @@ def scope_changes(
         needed = _widest_mm(
             task, candidate.tip.motion, thin_atlas.system.scope.outer_diameter_mm + 2.0 * room_mm
         )
-        system = _with_scope(task.system, needed)
-        plan = _assembled(replace(task, system=system), thin_atlas, candidate)
+        plan = _assembled(replace(task, system=_with_scope(task.system, needed)), thin_atlas, candidate)
         yield Counterfactual(
             parameter="a bronchoscope with an outer diameter",
             present=scope.outer_diameter_mm,
@@ -157,8 +156,7 @@ def _widest_mm(task: Task, motion: ScopeMotion, known_mm: float) -> float:
     """
     steps = math.floor(known_mm / SCOPE_STEP_MM + 1e-9)
     while (wider := round((steps + 1) * SCOPE_STEP_MM, 6)) < task.system.scope.outer_diameter_mm:
-        scope = _with_scope(task.system, wider).scope
-        if isinstance(prover_of(task.lung, scope).prove(motion), str):
+        if isinstance(prover_of(task.lung, _with_scope(task.system, wider).scope).prove(motion), str):
             break
         steps += 1
     return round(steps * SCOPE_STEP_MM, 6)
@@ -195,8 +193,7 @@ def _changed(system: System, **parts: Any) -> System:
 def _planned(task: Task, atlas: Atlas, system: System) -> Plan | None:
     """Return the plan of a direct arc with another system, None if there is none."""
     changed = replace(task, system=system)
-    arcs = DirectArcs(changed, replace(atlas, system=system))
-    for candidate in separated_candidates(arcs, 1, 1.0):
+    for candidate in separated_candidates(DirectArcs(changed, replace(atlas, system=system)), 1, 1.0):
         return _assembled(changed, atlas, candidate)
     return None
 

@@ -160,8 +160,7 @@ class _Found:
         rank[np.argsort(least, kind="stable")] = np.arange(len(least))
         place = rank[group.ravel()]
         order = np.lexsort((self.entries, self.cost, place))
-        first = np.flatnonzero(np.diff(place[order], prepend=-1))
-        best = order[first]
+        best = order[np.flatnonzero(np.diff(place[order], prepend=-1))]
         return FeasibleExits(
             entries=self.entries[order],
             place=place[order],

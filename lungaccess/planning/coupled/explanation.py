@@ -281,8 +281,7 @@ def _phases_with_a_plan(search: WindowSearch | WindowTubeSearch) -> str:
     simplest = "" if search.task.system.needle is None else " by a single arc"
     if asked is None:
         return f"No phase of the breath has a plan{simplest}; plan without --objective window"
-    motion = require_motion(search.task.lung)
-    middle = min(max(motion.masks_phase, asked[0]), asked[1])
+    middle = min(max(require_motion(search.task.lung).masks_phase, asked[0]), asked[1])
     widest = window_search(search.task, search.atlas, None, widest=True, middle=middle)
     best = (0.0, 0.0)
     for number, step in enumerate(widest.windows.steps()):

@@ -101,8 +101,7 @@ def open_source(
     from anatomy.io import read_mask
 
     said: list[str] = []
-    mask = read_mask(path, frame=frame, say=said.append)
-    centreline = from_mask(mask, rounded=True)
+    centreline = from_mask(read_mask(path, frame=frame, say=said.append), rounded=True)
     return RouteSource(name=path.stem, kind="mask", centreline=centreline, warnings=tuple(said))
 
 

@@ -202,8 +202,7 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
     enough = 0.95 * present.tip_offset_mm
 
     def rank(each: DesignProposal) -> tuple[float, float, float]:
-        short = max(enough - each.tip_offset_mm, 0.0)
-        return short, each.lateral_sweep_mm, each.tip_angle_rad
+        return max(enough - each.tip_offset_mm, 0.0), each.lateral_sweep_mm, each.tip_angle_rad
 
     lengths = {each.tubes.inner.curved_length_mm for each in found}
     chosen = [

@@ -301,8 +301,7 @@ class Policy:
         """
         # Tubes that are out are drawn back only where another placement promises so many times as much, since
         # each leaves a channel in tissue.
-        least = self.worth[left] / (2.0 if tubes_out else 1.0)
-        return np.asarray(chances >= max(least, LEAST_CHANCE))
+        return np.asarray(chances >= max(self.worth[left] / (2.0 if tubes_out else 1.0), LEAST_CHANCE))
 
     # Tubes ----------------------------------------------------------------------------------------
 
@@ -347,8 +346,7 @@ class Policy:
             row = np.zeros((1, *arcs.shape[1:]))
             row[0, : len(path)] = path
             one = slice(n, n + 1)
-            size = np.array([len(path)])
-            other = self._paths(row, size, tips[one], branches[one], targets[one])
+            other = self._paths(row, np.array([len(path)]), tips[one], branches[one], targets[one])
             if other[1][0] > chances[n]:
                 found[n], chances[n], arcs[n] = (each[0] for each in other)
         found[:, 0], found[:, 2] = chosen.found[:, 0], branches

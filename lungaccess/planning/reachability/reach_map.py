@@ -207,8 +207,7 @@ def reach_grid(lung: Lung, spacing_mm: float) -> Grid:
     size = np.ceil(np.array(lung.grid.shape) * lung.grid.spacing_mm / spacing_mm - 1e-9).astype(int)
     matrix = np.eye(4)
     matrix[:3, :3] = axes * spacing_mm
-    corner = lung.grid.lps(np.full(3, -0.5))
-    matrix[:3, 3] = corner + 0.5 * spacing_mm * axes.sum(axis=1)
+    matrix[:3, 3] = lung.grid.lps(np.full(3, -0.5)) + 0.5 * spacing_mm * axes.sum(axis=1)
     return Grid(shape=(int(size[0]), int(size[1]), int(size[2])), lps_from_ijk=matrix)
 
 

@@ -46,8 +46,7 @@ def rows_of(path: ArcPath) -> Float:
 
 def path_of(lps_from_start: Float, rows: Float) -> ArcPath:
     """Return the path of such rows."""
-    angles = np.arctan2(rows[:, 2], rows[:, 1])
-    rolls = np.diff(angles, prepend=0.0)
+    rolls = np.diff(np.arctan2(rows[:, 2], rows[:, 1]), prepend=0.0)
     rolls = np.remainder(rolls + math.pi, 2 * math.pi) - math.pi
     return ArcPath(
         lps_from_start=lps_from_start,
@@ -139,8 +138,7 @@ def program_weights(task: Task) -> Weights | None:
             return None
         weights = Weights(0.0, 0.0, weighed.voxel_sum)
     else:
-        needle = task.system.require_needle("The joint refinement")
-        by_width = weighed.tissue * needle.diameter_mm
+        by_width = weighed.tissue * task.system.require_needle("The joint refinement").diameter_mm
         weights = Weights(
             weighed.inverse_clearance + by_width, weighed.length, weighed.cost_map + by_width, weighed.tissue
         )

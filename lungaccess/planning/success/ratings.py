@@ -73,8 +73,7 @@ class ChanceRating:
         self.procedure = load_procedure() if open_loop else stated
         self._target = request.target.lps_mm
         self._radius_mm = goal_radius(request.lung, self._target, request.radius_mm)[0]
-        of_procedure = OPEN_LOOP if self.procedure.is_open_loop else MEASURED
-        self.rounds = SCREENING if open_loop else of_procedure
+        self.rounds = SCREENING if open_loop else OPEN_LOOP if self.procedure.is_open_loop else MEASURED
         self._processes = request.processes
 
     @property

@@ -148,8 +148,7 @@ class _Search:
         for _ in range(64 * design.designs):
             point = self._even.random(1)[0].tolist()
             if number:
-                centre = centres[len(found) % len(centres)].system
-                point = near(centre, design.vary, point, 0.5**number)
+                point = near(centres[len(found) % len(centres)].system, design.vary, point, 0.5**number)
             try:
                 system = device(self._base, design.vary, point)
             except SettingsError as error:

@@ -103,8 +103,7 @@ class RunMaker:
         results = self.results
         stored = results.finished_keys()
         missing = [run for run in runs if run.key not in stored]
-        there = {run.key for run in runs} & stored
-        others = results.made_with_other_kernels(there, software_kernels())
+        others = results.made_with_other_kernels({run.key for run in runs} & stored, software_kernels())
         for name in {run.planner.of_the_needle for run in missing if run.planner.is_of_ompl}:
             require_planner(name)
         added = failed = 0

@@ -124,8 +124,7 @@ def _plan_answer(run: runs.Run, opened: Opened, atlas: Atlas) -> runs.Answer:
         procedure=problem.procedure, method=planner.method, needle_planner=planner.needle_planner,
         seed=run.seed, iterations=run.iterations, time_s=problem.time_s,
     )  # fmt: skip
-    plans = plan(request, atlas=atlas, counterfactuals=not planner.without_counterfactuals)
-    for best in plans:
+    for best in plan(request, atlas=atlas, counterfactuals=not planner.without_counterfactuals):
         loss = request.goal.loss(best)
         # The last plan has the cost of the best, and a simpler motion of the scope.
         if np.isfinite(loss) and (not improvements or loss < improvements[-1].cost):

@@ -89,8 +89,7 @@ class Table(NamedTuple):
 
 def table(results: ResultsFile, name: str) -> Table:
     """Return one of the tables of `QUERIES`; FileError if the file cannot be read."""
-    columns = results.columns(QUERIES[name])
-    return Table(columns, results.rows(QUERIES[name]))
+    return Table(results.columns(QUERIES[name]), results.rows(QUERIES[name]))
 
 
 def differences(first: Path, second: Path) -> list[str]:

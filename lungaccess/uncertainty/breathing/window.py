@@ -108,8 +108,7 @@ def points_on_pieces(frame: Float, pieces: Float, arcs_mm: Float) -> Float:
     for n, (length, roll, curvature) in enumerate(pieces):
         last = n == len(pieces) - 1
         here = (arcs_mm >= begin) & ((arcs_mm < begin + length) | last)
-        lengths = np.append(arcs_mm[here] - begin, length)
-        poses = poses_on_arc(pose, roll, curvature, lengths)
+        poses = poses_on_arc(pose, roll, curvature, np.append(arcs_mm[here] - begin, length))
         points[here], pose, begin = poses[:-1, :3, 3], poses[-1], begin + length
     return points
 
@@ -147,8 +146,7 @@ def breathing_window(plan: Plan, lung: Lung, *, tolerance_mm: float = TOLERANCE_
         )
     leaves, devices = _leaves(plan, lung, float(tolerance_mm), WHOLE_BREATH, all_of_it=True)
     found = _window(motion, float(tolerance_mm), leaves, devices)
-    beside = float(np.linalg.norm(plan.end_lps - plan.goal_lps))
-    return replace(found, beside_target_mm=beside)
+    return replace(found, beside_target_mm=float(np.linalg.norm(plan.end_lps - plan.goal_lps)))
 
 
 def first_limit(plan: Plan, lung: Lung, phases: tuple[float, float]) -> WindowLimit | None:

@@ -201,13 +201,11 @@ def sensitivities(
     first_draws, second_draws = assessor.draws(samples, seed), assessor.draws(samples, second)
     base, other = first_draws.deviations(model), second_draws.deviations(model)
     from_base, from_other = assessor.successes(base), assessor.successes(other)
-    both = np.concatenate([from_base, from_other]).astype(float)
-    variance = float(both.var())
+    variance = float(np.concatenate([from_base, from_other]).astype(float).var())
     found = []
     for kind in kinds:
         own = first_draws.deviations(model.only(kind))
-        mixed = _with(base, kind, own, second_draws.deviations(model.only(kind)))
-        outcome = assessor.successes(mixed)
+        outcome = assessor.successes(_with(base, kind, own, second_draws.deviations(model.only(kind))))
         changes = share_of(outcome != from_base)
         explained = float(np.mean(from_other * (outcome.astype(float) - from_base)))
         found.append(

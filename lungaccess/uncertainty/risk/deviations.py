@@ -133,8 +133,7 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     and nothing goes farther than the device can.
     """
     devices, errors, which = DeviatedPlan(plan).kernel_inputs(deviations)
-    n_pieces = devices.n_tube + devices.needle.shape[0]
-    pieces = np.zeros((deviations.count, n_pieces, kernel.N_PIECE))
+    pieces = np.zeros((deviations.count, devices.n_tube + devices.needle.shape[0], kernel.N_PIECE))
     find_pieces(devices, errors, which, pieces)
     return pieces
 
@@ -401,8 +400,7 @@ class Draws:
         """Return the numbers of a kind at a level, the same at each call."""
         level += OF_PASS * self._pass_of.get(kind, 0) * (level != PATIENT)
         if (kind, level) not in self._made:
-            attempt = 0 if level == PATIENT else self._attempt
-            key = (list(UNITS).index(kind), level, attempt)
+            key = (list(UNITS).index(kind), level, 0 if level == PATIENT else self._attempt)
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=key)))
             # By columns: a further arc leaves the numbers of those before alone.
             columns = rng.standard_normal((*shape[1:], self.count))

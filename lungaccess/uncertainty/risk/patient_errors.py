@@ -229,8 +229,7 @@ def _at_place(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorM
 
 def _size_mm(motion: Motion, plan: Plan) -> float:
     """Return the motion that 95 % of the points of the target's lung do not exceed."""
-    left = motion.side_of(plan.target_lps) == LEFT
-    return motion.figures["left_95_mm" if left else "right_95_mm"]
+    return motion.figures["left_95_mm" if motion.side_of(plan.target_lps) == LEFT else "right_95_mm"]
 
 
 class PatientMotion:

@@ -100,8 +100,7 @@ class ReferenceSearch(ParallelSearch):
         self._budget = (rrt_iterations, None) if rrt_time_s is None else (None, rrt_time_s)
         self._tubes, self._design = TubeValidator(system, self.obstacles), design_arrays(system.tubes)
         needle = system.require_needle("Algorithm 1 of [Kuntz2015]")
-        required_mm = needle.radius_mm + system.margins.total_mm
-        self._needle_rrt = NeedleRRT(needle, required_mm, self.obstacles)
+        self._needle_rrt = NeedleRRT(needle, needle.radius_mm + system.margins.total_mm, self.obstacles)
         self.counts: Counter[str] = Counter()
         self.spent_s: defaultdict[str, float] = defaultdict(float)
         self.refused_by_proof: list[Refusal] = []

@@ -327,8 +327,7 @@ class TubeSearch(base.ParallelSearch):
         for entry, row in zip(entries.tolist(), found, strict=True):
             if not left or row[COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
                 return
-            made = self.arcs.made(self.arcs.tip(entry), row)
-            step = base.evaluated_step(self.evaluator, phase, made)
+            step = base.evaluated_step(self.evaluator, phase, self.arcs.made(self.arcs.tip(entry), row))
             left -= step.candidate is not None
             yield self.incumbent.improved(step)
 
@@ -337,8 +336,7 @@ class TubeSearch(base.ParallelSearch):
         number, parts = self.share
         ordered = base.different(self.atlas.deployments, self.clear)[number::parts]
         for iteration, entry in enumerate(ordered.tolist(), start=1):
-            step = self._shifted(int(entry))
-            yield self.incumbent.improved(replace(step, iteration=iteration))
+            yield self.incumbent.improved(replace(self._shifted(int(entry)), iteration=iteration))
 
     def _shifted(self, entry: int) -> base.Step:
         """Return the best deployment from tips along the motion to that of an entry."""

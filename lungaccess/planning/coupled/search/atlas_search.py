@@ -234,8 +234,7 @@ def sampling_near_target(
     """
     inside = base.different(arcs.atlas.deployments, arcs.by_bound[0])[: MOST // 2]
     target, most = arcs.task.target.lps_mm, MOST - len(inside)
-    needle = arcs.evaluator.environment.needle
-    outside = nearly_reaching(arcs.atlas, needle, target, most)
+    outside = nearly_reaching(arcs.atlas, arcs.evaluator.environment.needle, target, most)
     return LocalSampling(local_search, arcs, np.concatenate([inside, outside]), rng)
 
 

@@ -267,8 +267,7 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
     from anatomy.build import build_lung
     from anatomy.io.patients import load_patient
 
-    made = make_benchmark_phantom(case)
-    write_phantom(made, home, breathing=case.breathes, with_ct=with_ct)
+    write_phantom(make_benchmark_phantom(case), home, breathing=case.breathes, with_ct=with_ct)
     if with_tips:
         lung = build_lung(load_patient(home))
         for name in SYSTEMS:

@@ -146,8 +146,7 @@ def read_submission(path: Path) -> Submission:
         SettingsError: If something in it is missing, unknown, of the wrong type or not finite, or a query is
             unknown or answered twice; the message names the answer.
     """
-    content = read_json(path, expected="a submission in JSON", remedy=REMEDY)
-    return submission_of(content, path.name)
+    return submission_of(read_json(path, expected="a submission in JSON", remedy=REMEDY), path.name)
 
 
 def submission_of(content: object, where: str = "submission") -> Submission:

@@ -401,7 +401,7 @@ def needle_question(lung: Organ, system: System, lps_from_start: Float, target_l
         lung = with_entry(lung, point, reach_mm)
     environment = needle_environment(lung, needle, system.margins, with_fissures=not system.fissures_allowed)
     branches = pierced_branches(lung, point, environment.required_clearance_mm)
-    at_wall = begins_at_wall(lung, point, needle.radius_mm)
+    at_wall = bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=needle.radius_mm)[0] < needle.radius_mm)
     if at_wall:
         environment = begun_at_wall(environment, point, branches)
     query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
@@ -438,8 +438,3 @@ def _is_near(lung: Organ, point: Float, branch: int, near_mm: float) -> bool:
     labels = lung.labels[part]
     of_branch = ((labels & AIRWAY) != 0) & ((labels >> BRANCH_SHIFT).astype(int) - 1 == branch)
     return bool((lung.grid.box_distance_mm(voxels_in(part, of_branch), point) < near_mm).any())
-
-
-def begins_at_wall(lung: Organ, point: Float, radius_mm: float) -> bool:
-    """Tell whether a needle of this radius at a point `(3,)` LPS mm touches the lumen of an airway."""
-    return bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=radius_mm)[0] < radius_mm)

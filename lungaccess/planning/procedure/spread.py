@@ -53,7 +53,8 @@ def sizes_of(
         tip_turn=math.radians(tip.direction_deg),
         curvature=0.0 if steered else errors.term(CURVATURE).size, roll=0.0 if steered else rolled,
         stop=0.0 if needle is None else errors.needle_insertion.rms,
-        target=aimed, breathing=math.sqrt(max(foot**2 - aimed**2, 0.0)), bend=bend_per_mm(system),
+        target=aimed, breathing=math.sqrt(max(foot**2 - aimed**2, 0.0)),
+        bend=tubes.free_curvature_per_mm if tubes.planar else 0.0,
         steepest=1.0 if needle is None else needle.max_curvature_per_mm * errors.needle_curvature.median,
         slack=errors.term(CURVATURE).size, aside=aside_mm, tube_radius=tubes.inner.radius_mm,
         needle_radius=0.0 if needle is None else needle.radius_mm,
@@ -146,11 +147,6 @@ def around(lung: Lung, *, with_fissures: bool) -> kernel.Around:
         vessel.corners, lung.fields["pleura"].corners, fissure.corners, lung.fields["airway"].corners,
         vessel.geometry,
     )  # fmt: skip
-
-
-def bend_per_mm(system: System) -> float:
-    """Return the curvature with which the inner tube bends on as it goes farther; 0 where it is not one."""
-    return system.tubes.free_curvature_per_mm if system.tubes.planar else 0.0
 
 
 def _below(standard: Float) -> Float:

@@ -175,11 +175,6 @@ class Regions:
             for code, name in LOBES.items():
                 yield name, self.lobes.array == code
 
-    def segment_parts(self) -> Iterator[tuple[str, Mask]]:
-        """Yield the name and the voxels of each segment that has a named bronchus."""
-        for code, name in enumerate(self.segment_names, start=1):
-            yield name, self.segments.array == code
-
 
 def lung_regions(lung: Lung, grid: Grid, where: Mask) -> Regions:
     """Return the side of the voxels of a grid, any in the same place, that are true in `where`; 0 of others.

@@ -139,7 +139,8 @@ class ReachMap:
 
     def by_segment(self) -> tuple[RegionReach, ...]:
         """Return what is reached of each segment whose bronchus is named, see `anatomy.tree.naming`."""
-        return tuple(self._reach(name, where) for name, where in self.regions.segment_parts())
+        names, codes = self.regions.segment_names, self.regions.segments.array
+        return tuple(self._reach(name, codes == code) for code, name in enumerate(names, start=1))
 
     @property
     def total(self) -> RegionReach:

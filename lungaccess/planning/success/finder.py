@@ -5,6 +5,7 @@ plan and plans of several arcs take part and stay to the end: no winner is worse
 error of the draws that all have in common.
 """
 
+import math
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -102,16 +103,13 @@ class ContestFinder:
         of_cost = yield from self._by_cost(first)
         entries = [] if self._direct is None else ratings.ranked(self._rating, self._direct).tolist()
         pool = (made for made in map(self._entry, entries) if made)
-        screened = (yield from self._screened(of_cost)) if self._measures else []
+        # The contest begins in open loop where procedures are simulated that measure on their way.
+        measures = isinstance(self._rating, ratings.ChanceRating) and not self._rating.procedure.is_open_loop
+        screened = (yield from self._screened(of_cost)) if measures else []
         started = [*of_cost, *screened, *islice(pool, self._rating.rounds.pool)]
         order = yield from self._halved(self._rating, started)
         yield self._turn(0)
         yield from self._challenged(order[0], pool)
-
-    @property
-    def _measures(self) -> bool:
-        """Whether procedures are simulated that measure on their way."""
-        return isinstance(self._rating, ratings.ChanceRating) and not self._rating.procedure.is_open_loop
 
     def _first(self) -> Generator[Turn, None, Contender | None]:
         """Return the first plan of the search by cost that keeps the constraints, None if there is none."""
@@ -234,7 +232,9 @@ class ContestFinder:
         """Return another contender if it gains more: after each round it has to be near the best."""
         for number, draws in enumerate(self._rating.rounds.draws):
             other = _counted(other, number, draws)
-            error = ratings.standard_error(best.share, other.draws) if draws > 1 else 0.0
+            # The standard error of the share, never 0; a function says what is certain.
+            variance = max(best.share * (1.0 - best.share), 0.25 / other.draws) / other.draws
+            error = math.sqrt(variance) if draws > 1 else 0.0
             if other.share < best.share - 2.0 * error:
                 return None
         return other if other.gained > best.gained else None

@@ -181,8 +181,3 @@ def ranked(rating: Rating, direct: DirectCandidates) -> Int:
         if taken[site] <= rating.rounds.of_a_tip:
             kept.append(entry)
     return np.array(kept, dtype=np.int64)
-
-
-def standard_error(share: Float | float, draws: int) -> float:
-    """Return the standard error of a share of so many draws, never 0."""
-    return float(np.sqrt(max(float(share) * (1.0 - float(share)), 0.25 / draws) / draws))

@@ -19,25 +19,7 @@ from lungaccess.plans.no_plan import NoPlan
 from lungaccess.problem.request import Request
 from lungaccess.problem.target import Target
 from stages.needle import DEFAULT
-from stages.scope.tour import (
-    MOST_COMBINATIONS,
-    MOST_LESIONS,
-    Circuits,
-    Exit,
-    ExitRule,
-    ExitTest,
-    Itinerary,
-    Reading,
-    Resistances,
-    Subtree,
-    circuits,
-    combinations,
-    exits_of,
-    one_by_one_mm,
-    plan_itinerary,
-    shortest_tour,
-    subtree_to,
-)
+from stages.scope import tour as tours
 
 ITERATIONS = 100
 """Of the coupled planner for a lesion that no direct arc reaches: some seconds."""
@@ -57,10 +39,10 @@ class TourAnswer:
     lesions_lps: Float
     numbers: tuple[int, ...]
     left_out: Mapping[int, str]
-    subtree: Subtree
-    shortest: Itinerary
-    least_resistance: Itinerary | None
-    circuits: Circuits | None
+    subtree: tours.Subtree
+    shortest: tours.Itinerary
+    least_resistance: tours.Itinerary | None
+    circuits: tours.Circuits | None
     one_by_one_mm: float
     plan_required: bool
 
@@ -84,10 +66,10 @@ def read_lesions(path: str | Path) -> Float:
     """
     lines = [line.split("#")[0].strip() for line in read_text(path).splitlines()]
     points = [parse_point(line) for line in lines if line]
-    if not 1 <= len(points) <= MOST_LESIONS:
+    if not 1 <= len(points) <= tours.MOST_LESIONS:
         raise FileError(
             f"{path} names {len(points)} lesions",
-            expected=f"1 to {MOST_LESIONS}, one a line",
+            expected=f"1 to {tours.MOST_LESIONS}, one a line",
             remedy="Write lines such as lps:-57,131,-520",
         )
     return np.array(points)
@@ -96,10 +78,10 @@ def read_lesions(path: str | Path) -> Float:
 def lesions_of(lung: Lung) -> Float:
     """Return a patient's targets, `(M, 3)` LPS mm; TargetError if none came with it, or more than 62."""
     count = len(lung.targets_lps)
-    if not 1 <= count <= MOST_LESIONS:
+    if not 1 <= count <= tours.MOST_LESIONS:
         raise TargetError(
             f"Patient {lung.name} came with {count} targets",
-            expected=f"1 to {MOST_LESIONS} lesions",
+            expected=f"1 to {tours.MOST_LESIONS} lesions",
             remedy="Name them in a file for --targets; `lungaccess template lesions` prints an example",
         )
     return np.array(lung.targets_lps, dtype=np.float64)
@@ -109,9 +91,9 @@ def plan_tour(
     lung: Lung,
     lesions_lps: Float,
     *,
-    rule: ExitRule | None = None,
-    weights: Resistances | None = None,
-    reading: Reading = "printed",
+    rule: tours.ExitRule | None = None,
+    weights: tours.Resistances | None = None,
+    reading: tours.Reading = "printed",
     closed: bool = False,
     tissue_weight: float = 0.0,
     atlas: Atlas | None = None,
@@ -138,19 +120,19 @@ def plan_tour(
                 expected="a point in the lungs, in LPS mm",
                 remedy="Check the frame of the coordinates",
             )
-    chosen = rule or ExitRule()
+    chosen = rule or tours.ExitRule()
     if rule is None and atlas is not None:
         system, needle = atlas.system, atlas.system.needle
         reach = system.tubes.max_extension_mm + (0.0 if needle is None else needle.max_length_mm)
         # No exit farther from a lesion is of use: a lung is not wider.
-        chosen = ExitRule(reach_mm=min(reach, 200.0))
-    exits: list[tuple[Exit, ...]] = []
+        chosen = tours.ExitRule(reach_mm=min(reach, 200.0))
+    exits: list[tuple[tours.Exit, ...]] = []
     numbers: list[int] = []
     left_out: dict[int, str] = {}
     for number, lesion in enumerate(lesions, 1):
         try:
             accepts = None if atlas is None else coupled_plan_test(atlas, lesion, iterations)
-            exits.append(exits_of(lung.tree, len(exits), lesion, chosen, accepts))
+            exits.append(tours.exits_of(lung.tree, len(exits), lesion, chosen, accepts))
             numbers.append(number)
         except TargetError as error:
             left_out[number] = error.found
@@ -163,9 +145,9 @@ def plan_tour(
             expected="at least one lesion with an exit",
         )
     cost = [[tissue_weight * each.distance_mm for each in of_one] for of_one in exits]
-    subtree = subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
-    best = shortest_tour(subtree, closed=closed)
-    found = circuits(subtree) if combinations(subtree) <= MOST_COMBINATIONS else None
+    subtree = tours.subtree_to(lung.tree, exits, weights=weights, exit_cost_mm=cost)
+    best = tours.shortest_tour(subtree, closed=closed)
+    found = tours.circuits(subtree) if tours.combinations(subtree) <= tours.MOST_COMBINATIONS else None
     return TourAnswer(
         lesions_lps=lesions[np.array(numbers) - 1],
         numbers=tuple(numbers),
@@ -174,14 +156,14 @@ def plan_tour(
         shortest=best,
         least_resistance=None
         if found is None
-        else plan_itinerary(subtree, found.choice(reading), closed=closed),
+        else tours.plan_itinerary(subtree, found.choice(reading), closed=closed),
         circuits=found,
-        one_by_one_mm=one_by_one_mm(subtree, best.chosen, closed=closed),
+        one_by_one_mm=tours.one_by_one_mm(subtree, best.chosen, closed=closed),
         plan_required=atlas is not None,
     )
 
 
-def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> ExitTest:
+def coupled_plan_test(atlas: Atlas, lesion_lps: Float, iterations: int = ITERATIONS) -> tours.ExitTest:
     """Return the test whether a coupled plan leads from a tree point to a lesion, `(3,)` LPS mm.
 
     All deployments of the atlas whose workspace holds the lesion are tried with the direct arc, or without a
@@ -242,7 +224,7 @@ def tour_record(answer: TourAnswer) -> dict[str, Any]:
     }
 
 
-def _itinerary_record(tour: Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
+def _itinerary_record(tour: tours.Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
     subtree = tour.subtree
     used = [v for v in range(1, subtree.n_vertices) if tour.passes[v] > 0]
     return {

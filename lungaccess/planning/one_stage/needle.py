@@ -22,26 +22,7 @@ from anatomy.structures import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VE
 from lungaccess.plans.costs import known_costs
 from lungaccess.problem.system import System, load_system, needle_preset_names, preset_names
 from lungaccess.problem.target import Target
-from stages.needle import (
-    OMPL_PLANNERS,
-    OMPL_TOLERANCE_MM,
-    SHORTEST,
-    ArcPath,
-    InTissue,
-    NeedleEnvironment,
-    Objective,
-    Obstruction,
-    Passage,
-    Query,
-    Search,
-    begun_at_wall,
-    easiest_obstruction,
-    find_obstruction,
-    needle_environment,
-    path_costs,
-    require_planner,
-    searches,
-)
+from stages import needle as stage
 
 NAMES = ((VESSEL, "a vessel"), (FISSURE, "a fissure"), (OUTSIDE, "the outside of the organ"))
 LIMITS = {
@@ -59,7 +40,7 @@ def structure_in_words(label: int) -> str:
     return next((name for bit, name in NAMES if label & bit), "nothing")
 
 
-def reason_in_words(found: Obstruction) -> str:
+def reason_in_words(found: stage.Obstruction) -> str:
     """Return in a few words what is blocked, by what, and by how much."""
     if found.place == "reach":
         if found.limit != "radius":
@@ -90,7 +71,7 @@ def _needle_with(radius_mm: float) -> str:
     return f", which --system {name} has ({radii[name]:g} mm)" if name else ""
 
 
-def obstruction_rows(found: Obstruction, proved: bool, lobe: str = "") -> list[tuple[str, str]]:
+def obstruction_rows(found: stage.Obstruction, proved: bool, lobe: str = "") -> list[tuple[str, str]]:
     """Return what a table says of an obstruction, the reason first."""
     rows = [("reason", reason_in_words(found))]
     if found.place == "reach":
@@ -106,12 +87,12 @@ def obstruction_rows(found: Obstruction, proved: bool, lobe: str = "") -> list[t
     return rows
 
 
-def _place(found: Obstruction) -> str:
+def _place(found: stage.Obstruction) -> str:
     along = "" if found.inserted_mm is None else f"{found.inserted_mm:.1f} mm along the needle, "
     return f"{along}at {point_in_words(found.point_lps)}"
 
 
-def obstruction_record(found: Obstruction, proved: bool, lobe: str = "") -> dict[str, Any]:
+def obstruction_record(found: stage.Obstruction, proved: bool, lobe: str = "") -> dict[str, Any]:
     """Return plain JSON values: points in both frames, mm, angles in rad."""
     x, y, z = (float(v) for v in found.point_lps)
     branch = (found.label >> BRANCH_SHIFT) - 1
@@ -152,12 +133,12 @@ class PathSearch:
     """
 
     outcome: str
-    path: ArcPath | None = None
-    first_path: ArcPath | None = None
+    path: stage.ArcPath | None = None
+    first_path: stage.ArcPath | None = None
     cost: float = math.inf
     first_path_s: float | None = None
-    obstruction: Obstruction | None = None
-    open_passage: Passage | None = None
+    obstruction: stage.Obstruction | None = None
+    open_passage: stage.Passage | None = None
 
     @property
     def proved(self) -> bool:
@@ -166,11 +147,11 @@ class PathSearch:
 
 
 def search_path(
-    environment: NeedleEnvironment,
-    query: Query,
+    environment: stage.NeedleEnvironment,
+    query: stage.Query,
     planner: str,
     *,
-    objective: Objective = SHORTEST,
+    objective: stage.Objective = stage.SHORTEST,
     seed: int | None = 0,
     iterations: int | None = None,
     time_s: float | None = None,
@@ -186,21 +167,25 @@ def search_path(
         clock: Returns seconds: of the wall without compilation of kernels, or of this process.
         portion: Iterations between two looks at the clock.
     """
-    blocked = find_obstruction(environment, query)
+    blocked = stage.find_obstruction(environment, query)
     if blocked is not None and blocked.proved:
         return PathSearch(outcome="no path", obstruction=blocked)
-    if planner in OMPL_PLANNERS:
+    if planner in stage.OMPL_PLANNERS:
         found = _by_ompl(environment, query, planner, seed, time_s or 0.0, clock)
     else:
-        search = searches()[planner](environment, query, seed or 0, objective)
+        search = stage.searches()[planner](environment, query, seed or 0, objective)
         found = _advance(search, iterations, time_s, clock, portion)
     if found.path is not None:
         return found
-    return replace(found, obstruction=blocked or easiest_obstruction(environment, query))
+    return replace(found, obstruction=blocked or stage.easiest_obstruction(environment, query))
 
 
 def _advance(
-    search: Search, iterations: int | None, time_s: float | None, clock: Callable[[], float], portion: int
+    search: stage.Search,
+    iterations: int | None,
+    time_s: float | None,
+    clock: Callable[[], float],
+    portion: int,
 ) -> PathSearch:
     first, first_path_s = None, None
     began, left = clock(), iterations
@@ -225,8 +210,8 @@ def _advance(
 
 
 def _by_ompl(
-    environment: NeedleEnvironment,
-    query: Query,
+    environment: stage.NeedleEnvironment,
+    query: stage.Query,
     planner: str,
     seed: int | None,
     time_s: float,
@@ -239,7 +224,7 @@ def _by_ompl(
         seed_ompl(seed + 1)
     problem = NeedleProblem(environment)
     problem.setup.setPlanner(problem.planners()[planner](problem.si))
-    problem.pose(query, goal_tolerance_mm=max(OMPL_TOLERANCE_MM, environment.goal_tolerance_mm))
+    problem.pose(query, goal_tolerance_mm=max(stage.OMPL_TOLERANCE_MM, environment.goal_tolerance_mm))
     began = clock()
     problem.setup.solve(time_s)
     first_path_s = clock() - began
@@ -265,8 +250,8 @@ class NeedleQuestion:
         at_wall: Whether the needle begins so near to the lumen that it pierces the wall itself.
     """
 
-    environment: NeedleEnvironment
-    query: Query
+    environment: stage.NeedleEnvironment
+    query: stage.Query
     branches: tuple[int, ...]
     at_wall: bool
 
@@ -279,7 +264,7 @@ class NeedleAnswer(PathSearch, NeedleQuestion):
     """
 
     lobe: str
-    objective: Objective
+    objective: stage.Objective
 
     @property
     def branch(self) -> int:
@@ -294,9 +279,9 @@ class NeedleAnswer(PathSearch, NeedleQuestion):
         """
         if self.path is None:
             return {}
-        parts = [InTissue(self.path, self.environment.needle.diameter_mm)]
+        parts = [stage.InTissue(self.path, self.environment.needle.diameter_mm)]
         return self.objective.stated(
-            path_costs(self.environment.obstacles, self.environment.cost_map, self.path, parts)
+            stage.path_costs(self.environment.obstacles, self.environment.cost_map, self.path, parts)
         )
 
     @property
@@ -338,7 +323,7 @@ def plan_needle(
     target: Target,
     *,
     planner: str = "decide",
-    objective: str | Objective = "length",
+    objective: str | stage.Objective = "length",
     seed: int = 0,
     iterations: int | None = None,
     time_s: float | None = None,
@@ -353,12 +338,14 @@ def plan_needle(
             has been used in this process.
         TargetError: If the start lies outside the images, or the target is its point.
     """
-    weighed = Objective.of(objective)
-    require_planner(planner)
-    if time_s is None and (iterations is None or planner in OMPL_PLANNERS):
+    weighed = stage.Objective.of(objective)
+    stage.require_planner(planner)
+    if time_s is None and (iterations is None or planner in stage.OMPL_PLANNERS):
         raise SettingsError(
             f"The needle search {planner} has no limit",
-            expected="a time in seconds" if planner in OMPL_PLANNERS else "iterations or a time in seconds",
+            expected="a time in seconds"
+            if planner in stage.OMPL_PLANNERS
+            else "iterations or a time in seconds",
         )
     if not lung.grid.contains(lps_from_start[:3, 3]).all():
         raise TargetError(
@@ -399,12 +386,14 @@ def needle_question(lung: Organ, system: System, lps_from_start: Float, target_l
         # The surface of an organ is pierced at a start as near as this.
         reach_mm = needle.exit_exemption_mm + needle.radius_mm + system.margins.total_mm
         lung = with_entry(lung, point, reach_mm)
-    environment = needle_environment(lung, needle, system.margins, with_fissures=not system.fissures_allowed)
+    environment = stage.needle_environment(
+        lung, needle, system.margins, with_fissures=not system.fissures_allowed
+    )
     branches = pierced_branches(lung, point, environment.required_clearance_mm)
     at_wall = bool(lung.exact_clearance_mm(point, LUMEN, cap_mm=needle.radius_mm)[0] < needle.radius_mm)
     if at_wall:
-        environment = begun_at_wall(environment, point, branches)
-    query = Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
+        environment = stage.begun_at_wall(environment, point, branches)
+    query = stage.Query(lps_from_start=lps_from_start, target=target_lps, branch=[*branches, -1][0])
     return NeedleQuestion(environment=environment, query=query, branches=branches, at_wall=at_wall)
 
 

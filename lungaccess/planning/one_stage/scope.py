@@ -19,19 +19,7 @@ from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from stages.needle import KINDS, TriedStarts, try_around
-from stages.scope.advisor import (
-    Advisor,
-    Instruction,
-    ScopePath,
-    ThinnerScope,
-    camera_flight,
-    goal_at,
-    instructions_along,
-    lumen_of_lung,
-    model_of,
-    start_state,
-    why_stopped,
-)
+from stages.scope import advisor
 
 ADVICE_FILE, CAMERA_FILE = "advice.json", "camera.mrk.json"
 
@@ -43,10 +31,10 @@ class ScopeAdvice:
     `thinner` is what thinner scopes would reach; empty if this one reaches the goal.
     """
 
-    path: ScopePath
-    instructions: tuple[Instruction, ...]
+    path: advisor.ScopePath
+    instructions: tuple[advisor.Instruction, ...]
     why_stopped: str
-    thinner: tuple[ThinnerScope, ...]
+    thinner: tuple[advisor.ThinnerScope, ...]
 
     def as_json(self) -> dict[str, Any]:
         """Return all a reader needs as plain values; poses are in LPS mm, +z forward."""
@@ -87,24 +75,26 @@ def advise_scope(
         AnatomyError: If the scope fits nowhere in the trachea.
         TargetError: If the lesion is no sphere.
     """
-    lumen, model = lumen_of_lung(lung), model_of(system.scope)
-    start = start_state(lumen, lung.tree, model)
+    lumen, model = advisor.lumen_of_lung(lung), advisor.model_of(system.scope)
+    start = advisor.start_state(lumen, lung.tree, model)
     width = lumen.width_from(lumen.voxel_at(start.lps_from_base[:3, 3]))
     # A goal in the lesion is chosen, if there is one, where the scope has this clearance, about half a voxel.
     fits = width >= model.radius_mm + 0.25
-    advisor = Advisor(lumen, model, goal_at(lumen, lesion_lps, lesion_radius_mm, preferred=fits))
-    path = advisor.path(start, seed=seed)
+    guide = advisor.Advisor(
+        lumen, model, advisor.goal_at(lumen, lesion_lps, lesion_radius_mm, preferred=fits)
+    )
+    path = guide.path(start, seed=seed)
     return ScopeAdvice(
         path=path,
-        instructions=instructions_along(path, lung.tree),
-        why_stopped=why_stopped(path, advisor.field, lung.tree),
-        thinner=() if path.reached else advisor.thinner(start, seed=seed),
+        instructions=advisor.instructions_along(path, lung.tree),
+        why_stopped=advisor.why_stopped(path, guide.field, lung.tree),
+        thinner=() if path.reached else guide.thinner(start, seed=seed),
     )
 
 
 def save_advice(advice: ScopeAdvice, folder: Path) -> None:
     """Write the advice, and the camera's flight for 3D Slicer, into a folder; FileError if it cannot be."""
-    contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: camera_flight(advice.path).markups()}
+    contents = {ADVICE_FILE: advice.as_json(), CAMERA_FILE: advisor.camera_flight(advice.path).markups()}
     for name, content in contents.items():
         write_text(folder / name, json.dumps(content, indent=1))
 

@@ -13,26 +13,7 @@ from anatomy.base.files import atomic_write, read_toml
 from anatomy.base.records import frozen_value
 from anatomy.base.settings import impossible, parse, settings, text, to_mapping
 from lungaccess.problem.system import System, load_system
-from stages.tube import (
-    BEND_RAD,
-    DeployedSequence,
-    DesignProposal,
-    Equilibrium,
-    MakerLimits,
-    SequenceComparison,
-    ShapeLimits,
-    SnapError,
-    Tube,
-    TubeMechanics,
-    TubeShapes,
-    check_nesting,
-    deploy,
-    evaluate_design,
-    kuntz2015,
-    least_sweep_sequence,
-    open_shapes,
-    propose_designs,
-)
+from stages import tube as stage
 
 _REMEDY = "`lungaccess template tubes` prints a complete file to start from"
 MOST_TURN_RAD = 2.0 * math.pi
@@ -47,13 +28,13 @@ class BareTubes:
     """
 
     name: Annotated[str, text("name of the tubes")]
-    tubes: Annotated[tuple[Tube, ...], Field(description="the tubes, the innermost first")]
+    tubes: Annotated[tuple[stage.Tube, ...], Field(description="the tubes, the innermost first")]
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.tubes) <= 3:
             raise impossible("tubes", len(self.tubes), "one to three tables [[tubes]], the innermost first")
         try:
-            check_nesting(self.tubes)
+            stage.check_nesting(self.tubes)
         except SettingsError as error:
             raise impossible("tubes", error.found, error.expected) from None
 
@@ -72,9 +53,9 @@ class TubeAnswer:
     inner_mm: float
     rotation_rad: float
     relative_rad: float
-    final: Equilibrium
-    deployed: DeployedSequence | None
-    snap: SnapError | None
+    final: stage.Equilibrium
+    deployed: stage.DeployedSequence | None
+    snap: stage.SnapError | None
 
     @property
     def refusals(self) -> tuple[str, ...]:
@@ -147,15 +128,15 @@ def deploy_tubes(
             expected=f"at most one turn, {MOST_TURN_RAD:.4f} rad, either way",
             remedy="Leave out whole turns: every tenth of a turn is a step that is looked at",
         )
-    angles = np.array([rotation_rad, rotation_rad + relative_rad]) + BEND_RAD
-    sequence = kuntz2015(tubes, angles, outer_mm, inner_mm)
+    angles = np.array([rotation_rad, rotation_rad + relative_rad]) + stage.BEND_RAD
+    sequence = stage.kuntz2015(tubes, angles, outer_mm, inner_mm)
     shaft = device.tubes.needle_shaft if isinstance(device, System) else None
-    mechanics = TubeMechanics(tubes, needle=shaft)
+    mechanics = stage.TubeMechanics(tubes, needle=shaft)
     deployed, snap = None, None
     try:
-        deployed = deploy(mechanics, sequence)
+        deployed = stage.deploy(mechanics, sequence)
         final = deployed.final
-    except SnapError as error:
+    except stage.SnapError as error:
         snap = error
         final = mechanics.given_base_angles(sequence.base_angles_rad[-1], sequence.beta_mm[-1])
     return TubeAnswer(
@@ -171,15 +152,15 @@ def deploy_tubes(
     )
 
 
-def compare_sequences(answer: TubeAnswer) -> SequenceComparison:
+def compare_sequences(answer: TubeAnswer) -> stage.SequenceComparison:
     """Compare the sequences that lead to the same deployment."""
     final = answer.final
-    angles = np.array([answer.rotation_rad, answer.rotation_rad + answer.relative_rad]) + BEND_RAD
+    angles = np.array([answer.rotation_rad, answer.rotation_rad + answer.relative_rad]) + stage.BEND_RAD
     inserted, mechanics = (answer.inner_mm, answer.outer_mm), final.mechanics
-    return least_sweep_sequence(mechanics.tubes, angles, inserted, needle=mechanics.needle)
+    return stage.least_sweep_sequence(mechanics.tubes, angles, inserted, needle=mechanics.needle)
 
 
-def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProposal, ...]]:
+def design_choices(answer: TubeAnswer) -> tuple[stage.DesignProposal, tuple[stage.DesignProposal, ...]]:
     """Return the present design, and one proposal for each curved length, the least sweep first.
 
     Of each length it is the design with the least sweep that reaches about as far to the side as the present
@@ -193,15 +174,15 @@ def design_choices(answer: TubeAnswer) -> tuple[DesignProposal, tuple[DesignProp
             expected="a system, whose channel and limits say what can be made",
             remedy="Give a system, not just tubes",
         )
-    limits = MakerLimits(channel_diameter_mm=system.scope.channel_diameter_mm)
-    present = evaluate_design(system.tubes, answer.outer_mm, answer.inner_mm)
-    found = propose_designs(
+    limits = stage.MakerLimits(channel_diameter_mm=system.scope.channel_diameter_mm)
+    present = stage.evaluate_design(system.tubes, answer.outer_mm, answer.inner_mm)
+    found = stage.propose_designs(
         system.tubes, answer.outer_mm, answer.inner_mm, system.tubes.max_lateral_sweep_mm, limits
     )
     # Share of the present reach that counts as about as far.
     enough = 0.95 * present.tip_offset_mm
 
-    def rank(each: DesignProposal) -> tuple[float, float, float]:
+    def rank(each: stage.DesignProposal) -> tuple[float, float, float]:
         return max(enough - each.tip_offset_mm, 0.0), each.lateral_sweep_mm, each.tip_angle_rad
 
     lengths = {each.tubes.inner.curved_length_mm for each in found}
@@ -242,32 +223,34 @@ def tubes_record(answer: TubeAnswer) -> dict[str, Any]:
     }
 
 
-def tubes_of(device: System | BareTubes) -> tuple[Tube, ...]:
+def tubes_of(device: System | BareTubes) -> tuple[stage.Tube, ...]:
     """Return the tubes, the innermost first."""
     if isinstance(device, System):
         return device.tubes.nested
     return device.tubes
 
 
-def design_shapes(device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None) -> TubeShapes:
+def design_shapes(
+    device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None
+) -> stage.TubeShapes:
     """Return the shapes of a design, of bare tubes by default limits; cache and errors: `open_shapes`."""
-    limits, needle = ShapeLimits(), None
+    limits, needle = stage.ShapeLimits(), None
     if isinstance(device, System):
         stated = device.tubes
         needle = stated.needle_shaft
-        limits = ShapeLimits(
+        limits = stage.ShapeLimits(
             max_extension_mm=stated.max_extension_mm,
             max_lateral_sweep_mm=stated.max_lateral_sweep_mm,
             max_strain=stated.max_strain,
         )
-    return open_shapes(tubes_of(device), limits, needle=needle, cache=cache)
+    return stage.open_shapes(tubes_of(device), limits, needle=needle, cache=cache)
 
 
 COSTS = ("lateral_sweep_mm", "follow_the_leader_error_mm", "strain", "arc_error_mm")
 """The values that are told of every shape of a design beside its tip, in this order."""
 
 
-def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
+def shapes_record(name: str, shapes: stage.TubeShapes) -> dict[str, Any]:
     """Return what a design can do as plain JSON types: mm, rad."""
     tips = shapes.scope_from_tip
     aside = np.hypot(tips[:, 0, 3], tips[:, 1, 3])
@@ -291,7 +274,7 @@ def shapes_record(name: str, shapes: TubeShapes) -> dict[str, Any]:
     }
 
 
-def save_shapes(shapes: TubeShapes, path: Path) -> None:
+def save_shapes(shapes: stage.TubeShapes, path: Path) -> None:
     """Write all shapes as CSV, the innermost tube first, with tip and costs; FileError if it cannot be."""
     n = len(shapes.tubes)
     columns = {

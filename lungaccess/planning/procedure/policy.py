@@ -19,18 +19,7 @@ from anatomy.lung import Lung
 from anatomy.structures import AIRWAY, OUTSIDE, VESSEL, obstacle_bits
 from lungaccess.planning.coupled.search.aimed_tubes import AimedFromPose
 from lungaccess.planning.one_stage import replan_from_tube
-from lungaccess.planning.procedure import spread
-from lungaccess.planning.procedure.choices import (
-    DRAWS,
-    Action,
-    Decision,
-    Measurements,
-    Offer,
-    offered,
-    planned_choice,
-    scope_frames,
-    with_choices,
-)
+from lungaccess.planning.procedure import choices, spread
 from lungaccess.planning.procedure.kernels import decisions as kernel
 from lungaccess.plans.assemble import needle_part, tube_part
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -179,13 +168,13 @@ class Policy:
         every = np.broadcast_to(expected, measured.shape)
         likely = np.array(spread.fused(every, spread.scope_moves(every, *known), measured, *noise))
         likely[:, :3, 3] = self._in_lumen(likely[:, :3, 3])
-        drawn = np.zeros((len(likely), DRAWS, 3))
+        drawn = np.zeros((len(likely), choices.DRAWS, 3))
         shifts = self._planned_choice.errors[:, :3]
         fallback = self._in_lumen((likely[:, None, :3, 3] + shifts).reshape(-1, 3)).reshape(drawn.shape)
         mean = np.ascontiguousarray(likely[:, :3, 3])
         kernel.find_places(
             self._places, np.ascontiguousarray(measured[:, :3, 3]), noise[0], fallback,
-            (np.arange(DRAWS) + 0.5) / DRAWS, mean, drawn,
+            (np.arange(choices.DRAWS) + 0.5) / choices.DRAWS, mean, drawn,
         )  # fmt: skip
         likely[:, :3, 3] = self._in_lumen(mean)
         return Placed(likely, drawn)
@@ -214,7 +203,7 @@ class Policy:
     def as_planned(self, count: int) -> Chosen:
         """Return that the plan is carried out as it is where the scope is not measured, N times."""
         frame = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
-        every = np.ascontiguousarray(self._places[:DRAWS])[None]
+        every = np.ascontiguousarray(self._places[: choices.DRAWS])[None]
         alone = self._chosen(Placed(frame, every), self._planned_choice)
         arcs = np.zeros_like(alone.arcs)
         arcs[0, : len(self._planned)] = self._planned
@@ -223,14 +212,14 @@ class Policy:
             np.zeros(count, int)
         )
 
-    def _chosen(self, placed: Placed, choices: kernel.Choices) -> Chosen:
+    def _chosen(self, placed: Placed, among: kernel.Choices) -> Chosen:
         frames, count = placed.frames, len(placed.frames)
         found, chances = np.zeros((count, 3), dtype=np.int64), np.zeros(count)
         arcs = np.zeros((count, max(LONGEST, len(self._planned)), 3))
         x, y, z = self._target.tolist()
         # Another needle than one that is planned again behind the tubes starts blindly.
         known = self._left, self._left._replace(tip_known=False, tip=0.0)
-        prepared = self._scene, known, *self._tube_arrays, choices, self._planned, self._vias
+        prepared = self._scene, known, *self._tube_arrays, among, self._planned, self._vias
         frames = np.ascontiguousarray(frames)
 
         def choose(part: slice) -> None:
@@ -248,9 +237,9 @@ class Policy:
                 self._deployed(frame, n) for frame, n in zip(frames, chosen.tolist(), strict=True)
             )
         return Chosen(
-            frames=frames, tips=frames @ choices.scope_from_tip[chosen], found=found, chances=chances,
+            frames=frames, tips=frames @ among.scope_from_tip[chosen], found=found, chances=chances,
             arcs=arcs, changed=(chosen > 0) | ~same,
-            tubes=choices.tubes[chosen] if len(choices.tubes) else choices.tubes, deployed=deployed,
+            tubes=among.tubes[chosen] if len(among.tubes) else among.tubes, deployed=deployed,
         )  # fmt: skip
 
     def _aimed(self, placed: Placed) -> Chosen:
@@ -261,7 +250,7 @@ class Policy:
             made = [] if found is None else [found[0]]
             chosen = self._chosen(
                 Placed(frame[None], placed.drawn[n : n + 1]),
-                with_choices(self._planned_choice, self.system, made, [frame] * len(made)),
+                choices.with_choices(self._planned_choice, self.system, made, [frame] * len(made)),
             )
             tube = self.plan.tube
             if found is not None and chosen.found[0, 0] > 0:
@@ -409,7 +398,7 @@ class Policy:
 
     # One answer -----------------------------------------------------------------------------------
 
-    def decide(self, measured: Measurements) -> Decision:
+    def decide(self, measured: choices.Measurements) -> choices.Decision:
         """Return what to do next after what was measured since the scope was placed last.
 
         The same measurements give the same decision.  A stage that the procedure does not measure may be left
@@ -443,17 +432,19 @@ class Policy:
             return self._decision(chosen, left, tubes_out=True)
         return self._on_the_way(chosen, spread.mean_pose(poses.needle), target[0])
 
-    def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> Decision:
+    def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> choices.Decision:
         chance, changed = float(chosen.chances[0]), bool(chosen.changed[0])
         action = (
-            Action.DEPLOY if chosen.found[0, 0] or (changed and self.plan.needle is None) else Action.NEEDLE
+            choices.Action.DEPLOY
+            if chosen.found[0, 0] or (changed and self.plan.needle is None)
+            else choices.Action.NEEDLE
         )
-        if tubes_out and action is Action.DEPLOY:
-            action = Action.NEEDLE
+        if tubes_out and action is choices.Action.DEPLOY:
+            action = choices.Action.NEEDLE
         if not changed:
-            action = Action.GO_ON
+            action = choices.Action.GO_ON
         if not self.goes_on(chosen.chances, left, tubes_out=tubes_out)[0]:
-            action = Action.PLACE_AGAIN if left else Action.STOP
+            action = choices.Action.PLACE_AGAIN if left else choices.Action.STOP
         needle = None
         if self.plan.needle is not None:
             path = ArcPath(lps_from_start=chosen.tips[0], arcs=chosen.arcs[0, : chosen.found[0, 1]])
@@ -462,13 +453,13 @@ class Policy:
         if not tubes_out:
             tube = next(iter(chosen.deployed), None) or self._deployed(chosen.frames[0], chosen.found[0, 0])
             tube = replace(tube, lps_from_tip=chosen.tips[0])
-        return Decision(
+        return choices.Decision(
             action=action, chance=chance, again=self.worth[left],
             lps_from_device=chosen.tips[0] if tubes_out else chosen.frames[0], tube=tube, needle=needle,
             branch=int(chosen.found[0, 2]),
         )  # fmt: skip
 
-    def _on_the_way(self, chosen: Chosen, pose: Float, target: Float) -> Decision:
+    def _on_the_way(self, chosen: Chosen, pose: Float, target: Float) -> choices.Decision:
         """Return the decision about a needle on its way: what lies behind the nearest point is inserted."""
         path = ArcPath(lps_from_start=chosen.tips[0], arcs=chosen.arcs[0, : chosen.found[0, 1]])
         # Spacing of the points of a path of which the one nearest to a needle's tip tells how much is
@@ -480,9 +471,9 @@ class Policy:
         way = OnTheWay(rest, inserted, turned, path.lps_from_start[:3, 2], branch)
         arcs, chance, _proved = self.from_needle(way, pose, target)
         same = arcs.shape == rest.shape and bool(_same(arcs[None], rest[None])[0])
-        action = Action.GO_ON if same else Action.NEEDLE
-        return Decision(
-            action=action if chance >= LEAST_CHANCE else Action.STOP, chance=chance, again=0.0,
+        action = choices.Action.GO_ON if same else choices.Action.NEEDLE
+        return choices.Decision(
+            action=action if chance >= LEAST_CHANCE else choices.Action.STOP, chance=chance, again=0.0,
             lps_from_device=pose, tube=None, branch=branch,
             needle=needle_part(ArcPath(lps_from_start=pose, arcs=arcs)),
         )  # fmt: skip
@@ -493,24 +484,24 @@ class Policy:
     def _imagined(self) -> Placed:
         """Tips of the scope as they may be measured, IMAGINED of them."""
         drawn = self.assessor.draws(IMAGINED, _SEED).deviations(self.errors)
-        true = scope_frames(deviated_starts(self.plan, self.lung, drawn))
+        true = choices.scope_frames(deviated_starts(self.plan, self.lung, drawn))
         noise = np.random.default_rng(_SEED).standard_normal((IMAGINED, 5))
         size = self.procedure.scope.position_mm, self.procedure.scope.direction_deg
         return self.scopes_measured(spread.as_measured(true, *size, noise))
 
     @cached_property
-    def _offer(self) -> Offer:
+    def _offer(self) -> choices.Offer:
         planned = np.asarray(self.plan.scope.lps_from_scope_tip)[None]
         # Deployments to choose from are looked for from the planned tip, and from five imagined ones.
         frames = np.concatenate([planned, self._imagined.frames[:5]])
-        return offered(
+        return choices.offered(
             self.plan, self.lung, self.system, self.errors, self.procedure, self.assessor.radius_mm,
             self._left, frames,
         )  # fmt: skip
 
     @cached_property
     def _planned_choice(self) -> kernel.Choices:
-        return planned_choice(self.plan, self._left)
+        return choices.planned_choice(self.plan, self._left)
 
     @cached_property
     def environment(self) -> NeedleEnvironment:

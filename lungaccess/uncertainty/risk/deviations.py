@@ -15,16 +15,7 @@ from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int
 from anatomy.lung import Lung
 from lungaccess.plans.plan import Plan
-from lungaccess.problem.errors import (
-    BOUNDED,
-    BREATHING,
-    CURVATURE,
-    IN_WINDOW,
-    RESTING,
-    UNITS,
-    VESSEL_BORDER,
-    ErrorModel,
-)
+from lungaccess.problem import errors
 from lungaccess.uncertainty.risk.kernels import deviation as kernel
 from lungaccess.uncertainty.risk.kernels.chain import TUBE_PIECES, Devices
 from lungaccess.uncertainty.risk.kernels.outcomes import N_START, Judging, find_pieces, find_starts
@@ -108,7 +99,7 @@ FIELD_OF: dict[str, str] = {
     "needle_roll": "roll_rad",
     "needle_insertion": "stop_mm",
     "target_position": "target_mm",
-    VESSEL_BORDER: "border_mm",
+    errors.VESSEL_BORDER: "border_mm",
 }
 """The field of `Deviations` that holds each kind of error."""
 
@@ -119,9 +110,9 @@ def deviated_starts(plan: Plan, lung: Lung, deviations: Deviations) -> Float:
     The scope tip stands where the lumen is as deep as the scope's radius, or as deep as at the planned tip if
     that is less: a shift ends where it would come out of that.
     """
-    devices, errors, _which = DeviatedPlan(plan).kernel_inputs(deviations)
+    devices, rows, _which = DeviatedPlan(plan).kernel_inputs(deviations)
     starts = np.zeros((deviations.count, N_START))
-    find_starts(devices, errors, judging(plan, lung), starts)
+    find_starts(devices, rows, judging(plan, lung), starts)
     return starts
 
 
@@ -132,9 +123,9 @@ def deviated_pieces(plan: Plan, deviations: Deviations) -> Float:
     goes back behind the scope tip, nor one behind that around it, nor the needle behind the end of an arc;
     and nothing goes farther than the device can.
     """
-    devices, errors, which = DeviatedPlan(plan).kernel_inputs(deviations)
+    devices, rows, which = DeviatedPlan(plan).kernel_inputs(deviations)
     pieces = np.zeros((deviations.count, devices.n_tube + devices.needle.shape[0], kernel.N_PIECE))
-    find_pieces(devices, errors, which, pieces)
+    find_pieces(devices, rows, which, pieces)
     return pieces
 
 
@@ -316,7 +307,7 @@ class Draws:
         self._made: dict[tuple[str, int], Float] = {}
         self._further, self._pass_of = tuple(further), dict[str, int]()
 
-    def deviations(self, model: ErrorModel) -> Deviations:
+    def deviations(self, model: errors.ErrorModel) -> Deviations:
         """Return the deviations of all attempts under a model."""
         values = no_deviations(self.count, self._n_arcs, self._n_twisted)
         for kind, field in FIELD_OF.items():
@@ -328,7 +319,7 @@ class Draws:
                 if term.bias:
                     bias = np.array(term.bias)
                     error = error + (self._axes @ bias if kind == "scope_position" else bias)
-                values[own] = np.radians(error) if UNITS[kind] == "deg" else error
+                values[own] = np.radians(error) if errors.UNITS[kind] == "deg" else error
         values["factor"] = self._factors(model)
         if model.breathing.size and (self._motion or self._stretch):
             values["target_mm"] = values["target_mm"] + self._breathed_mm(model)
@@ -341,7 +332,7 @@ class Draws:
         own._n_arcs, own._pass_of, own._further = n_arcs, dict(pass_of), ()
         return own
 
-    def numbers(self, model: ErrorModel) -> dict[tuple[str, int], Float]:
+    def numbers(self, model: errors.ErrorModel) -> dict[tuple[str, int], Float]:
         """Return the standard normal numbers `(N, ...)` that a model uses, by kind and level."""
         own = self.with_numbers({})
         own.deviations(model)
@@ -356,7 +347,7 @@ class Draws:
     def _error(
         self, kind: str, shape: tuple[int, ...], distribution: str, patient: float, attempt: float
     ) -> Float:
-        if distribution == RESTING:
+        if distribution == errors.RESTING:
             raise SettingsError(
                 f"Errors of {kind} are about the resting shaft of a plan, which is not known here",
                 expected="an error model of `lungaccess.uncertainty.risk.patient_errors.model_for`",
@@ -367,30 +358,32 @@ class Draws:
         for level, size in ((PATIENT, patient), (ATTEMPT, attempt)):
             if size:
                 drawn = self._normal(kind, level, (shape[0], 1) if shared and level == PATIENT else shape)
-                total += size * (drawn if distribution != BOUNDED else 2.0 * _uniform(drawn) - 1.0)
+                total += size * (drawn if distribution != errors.BOUNDED else 2.0 * _uniform(drawn) - 1.0)
         return total
 
-    def _factors(self, model: ErrorModel) -> Float:
+    def _factors(self, model: errors.ErrorModel) -> Float:
         """Return the factors of the curvature, `(N,)`."""
         term = model.needle_curvature
-        error = self._error(CURVATURE, (self.count,), term.distribution, term.patient, term.attempt)
+        error = self._error(errors.CURVATURE, (self.count,), term.distribution, term.patient, term.attempt)
         factors = term.median * np.exp(error)
         if term.straight_share:
             # Stream of the numbers that decide which needles go straight.
-            straight = _uniform(self._normal(CURVATURE, 2, (self.count,))) < term.straight_share
+            straight = _uniform(self._normal(errors.CURVATURE, 2, (self.count,))) < term.straight_share
             factors[straight] = 0.0
         return factors
 
-    def _breathed_mm(self, model: ErrorModel) -> Float:
+    def _breathed_mm(self, model: errors.ErrorModel) -> Float:
         """Return how the target moves away from the scope, `(N, 3)`."""
         term, shape = model.breathing, (self.count,)
-        motion_mm = term.median_mm * np.exp(term.patient_ln * self._normal(BREATHING, PATIENT, shape))
-        luck, in_window = _uniform(self._normal(BREATHING, ATTEMPT, shape)), term.distribution == IN_WINDOW
+        motion_mm = term.median_mm * np.exp(term.patient_ln * self._normal(errors.BREATHING, PATIENT, shape))
+        luck = _uniform(self._normal(errors.BREATHING, ATTEMPT, shape))
+        in_window = term.distribution == errors.IN_WINDOW
         if self._motion is not None and (self._motion.has_window or not in_window):
             return self._motion.shifts_mm(motion_mm, luck, in_window=in_window)
         if in_window:
             raise SettingsError(
-                f"Errors of breathing are {IN_WINDOW!r}, but no motion of the patient or no window is known",
+                f"Errors of breathing are {errors.IN_WINDOW!r}, but no motion of the patient or no window is "
+                "known",
                 expected="a plan with a window of breathing",
                 remedy="Give the patient a [motion], or write distribution = 'lognormal'",
             )
@@ -400,7 +393,7 @@ class Draws:
         """Return the numbers of a kind at a level, the same at each call."""
         level += OF_PASS * self._pass_of.get(kind, 0) * (level != PATIENT)
         if (kind, level) not in self._made:
-            key = (list(UNITS).index(kind), level, 0 if level == PATIENT else self._attempt)
+            key = (list(errors.UNITS).index(kind), level, 0 if level == PATIENT else self._attempt)
             rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(self._seed, spawn_key=key)))
             # By columns: a further arc leaves the numbers of those before alone.
             columns = rng.standard_normal((*shape[1:], self.count))

@@ -11,14 +11,7 @@ from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
 from anatomy.structures import obstacle_bits
 from lungaccess.planning.coupled.atlas import Atlas
-from lungaccess.planning.coupled.kernels.aimed_tubes import (
-    COST,
-    JOINTS,
-    MISSES,
-    ROTATION,
-    SPOILT_WAY,
-    aim_tubes,
-)
+from lungaccess.planning.coupled.kernels import aimed_tubes as kernel
 from lungaccess.planning.coupled.search import base
 from lungaccess.plans.candidate import Candidate, tubes_in_tissue
 from lungaccess.plans.evaluator import CandidateEvaluator
@@ -97,11 +90,11 @@ class TubeAiming:
               why tubes refuse it.
         """
         scratch = shape_arrays(self._design), shape_arrays(self._design)
-        found = np.zeros((len(row_of), JOINTS + len(scratch[0].joints)))
+        found = np.zeros((len(row_of), kernel.JOINTS + len(scratch[0].joints)))
         why = np.zeros(len(row_of), dtype=np.int64)
         tube = (self._environment, self._constants, self._design, *scratch)
         points = np.ascontiguousarray(np.broadcast_to(ends, (len(tips), 3)))
-        aim_tubes(
+        kernel.aim_tubes(
             tube, self._obstacles, *self._weights, tips, allowed, row_of.astype(np.int64), starts,
             points, enough or len(row_of), found, why,
         )  # fmt: skip
@@ -158,8 +151,8 @@ class AimedFromPose:
         )
         reasons = reasons_of(why)
         self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons.items()}
-        for n in np.argsort(found[:, COST], kind="stable").tolist():
-            if not np.isfinite(found[n, COST]):
+        for n in np.argsort(found[:, kernel.COST], kind="stable").tolist():
+            if not np.isfinite(found[n, kernel.COST]):
                 break
             made = self._evaluator.tubes.choose(frame, *chosen_of(task.system.tubes, found[n]))
             if isinstance(made, str):
@@ -185,16 +178,16 @@ class AimedFromPose:
 
 def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, TubeShape]:
     """Return a row of what was found as `DeploymentValidator.choose` takes it."""
-    made = deployed(design_arrays(tubes), *np.split(found[JOINTS:], 2))
+    made = deployed(design_arrays(tubes), *np.split(found[kernel.JOINTS :], 2))
     if made is None:
         raise ValueError("the way to a shape that was found keeps the limits of its design")
-    return float(found[ROTATION]), shape_of_arrays(made)
+    return float(found[kernel.ROTATION]), shape_of_arrays(made)
 
 
 def reasons_of(why: Int) -> dict[str, int]:
     """Return how many attempts (N,) each reason refused, in words."""
     codes, counts = np.unique(why, return_counts=True)
-    names = {MISSES: NO_SOLUTION, SPOILT_WAY: NO_WAY, **REASONS}
+    names = {kernel.MISSES: NO_SOLUTION, kernel.SPOILT_WAY: NO_WAY, **REASONS}
     return {names[c]: n for c, n in zip(codes.tolist(), counts.tolist(), strict=True) if c in names}
 
 
@@ -240,7 +233,7 @@ class AimedTubes:
     def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
         """Return for entries (E,) why they are refused, 0 if not, their estimated costs, and the least."""
         found, why = self.aim(chosen)
-        return why, found[:, COST], float(found[:, COST].min(initial=math.inf))
+        return why, found[:, kernel.COST], float(found[:, kernel.COST].min(initial=math.inf))
 
     def clear(self) -> Int:
         """Return the entries (C,) with a deployment that ends there, the cheapest first."""
@@ -272,15 +265,15 @@ class AimedTubes:
 
     def made(self, tip: ScopeTip, found: Float) -> Candidate | None:
         """Return a row of what was found as a candidate, None if the tubes are refused."""
-        if not np.isfinite(found[COST]):
+        if not np.isfinite(found[kernel.COST]):
             return None
         return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))
 
 
 def cheapest_first(found: Float) -> Int:
     """Return the rows (C,) of what was found (N, ...) that have a deployment, the cheapest first."""
-    clear = np.flatnonzero(np.isfinite(found[:, COST]))
-    return clear[np.argsort(found[clear, COST], kind="stable")]
+    clear = np.flatnonzero(np.isfinite(found[:, kernel.COST]))
+    return clear[np.argsort(found[clear, kernel.COST], kind="stable")]
 
 
 CHUNK = 200
@@ -316,7 +309,7 @@ class TubeSearch(base.ParallelSearch):
             yield base.Step(iteration=0, phase=phase)
             yield from self._finalists(phase, chunk[order], found[order])
             clear.append(chunk[order])
-            costs.append(found[order, COST])
+            costs.append(found[order, kernel.COST])
         self.clear = np.concatenate(clear)[np.argsort(np.concatenate(costs), kind="stable")]
 
     def _finalists(self, phase: str, entries: Int, found: Float) -> Iterator[base.Step]:
@@ -325,7 +318,7 @@ class TubeSearch(base.ParallelSearch):
         # order.
         left = 3
         for entry, row in zip(entries.tolist(), found, strict=True):
-            if not left or row[COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
+            if not left or row[kernel.COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
                 return
             step = base.evaluated_step(self.evaluator, phase, self.arcs.made(self.arcs.tip(entry), row))
             left -= step.candidate is not None
@@ -345,14 +338,14 @@ class TubeSearch(base.ParallelSearch):
         tip, best = self.arcs.tip(entry), first
         for shifts_mm in ROWS_MM:
             row = self.evaluator.tip_rows.along(tip, shifts_mm)
-            starts = aim_starts(tubes, best[JOINTS:], len(shifts_mm))
+            starts = aim_starts(tubes, best[kernel.JOINTS :], len(shifts_mm))
             if starts is None:
                 break
             rows, why = self.arcs.aim_from(row.tips, row.proved, starts)
             self.blocked.update(self.arcs.reasons(why))
             order = cheapest_first(rows)
-            if len(order) and rows[order[0], COST] < best[COST]:
+            if len(order) and rows[order[0], kernel.COST] < best[kernel.COST]:
                 best, tip = rows[order[0]], self.evaluator.tip_rows.tip(row, int(order[0]))
-        if best is first or best[COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
+        if best is first or best[kernel.COST] > base.ESTIMATE_SLACK * self.incumbent.cost:
             return base.Step(iteration=0, phase=phase)
         return base.evaluated_step(self.evaluator, phase, self.arcs.made(tip, best))

@@ -166,24 +166,13 @@ def _leaves(
     motion = require_motion(lung)
     side, devices = motion.side_of(plan.target_lps), device_points(plan)
     tip = plan.scope.lps_from_scope_tip[:3, 3]
-    leaves = np.zeros((MOST_LEAVES, 5))
-    count = divide(
-        tissue_of(plan, lung),
-        breath_of(motion, side),
-        carrier(motion, tip, side),
-        devices.points,
-        devices.arc_mm,
-        devices.sections,
-        np.array(plan.goal_lps),
-        miss_allowed(motion, tolerance_mm, distance_mm(devices.points[-1], tip)),
-        devices.hole_lps,
-        miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip)),
-        float(motion.amplitude),
-        float(motion.masks_phase),
-        phases,
-        all_of_it,
-        leaves,
-    )
+    leaves, end = np.zeros((MOST_LEAVES, 5)), devices.points[-1]
+    target = np.array(plan.goal_lps), miss_allowed(motion, tolerance_mm, distance_mm(end, tip))
+    hole_mm = miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip))
+    about = tissue_of(plan, lung), breath_of(motion, side), carrier(motion, tip, side)
+    what = *about, devices.points, devices.arc_mm, devices.sections, *target, devices.hole_lps, hole_mm
+    breath = float(motion.amplitude), float(motion.masks_phase)
+    count = divide(*what, *breath, phases, all_of_it, leaves)
     return leaves[:count], devices
 
 

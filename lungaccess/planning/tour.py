@@ -226,7 +226,6 @@ def tour_record(answer: TourAnswer) -> dict[str, Any]:
 
 def _itinerary_record(tour: tours.Itinerary, numbers: Sequence[int]) -> dict[str, Any]:
     subtree = tour.subtree
-    used = [v for v in range(1, subtree.n_vertices) if tour.passes[v] > 0]
     return {
         "closed": tour.closed,
         "length_mm": tour.length_mm,
@@ -250,6 +249,7 @@ def _itinerary_record(tour: tours.Itinerary, numbers: Sequence[int]) -> dict[str
                 "passes": int(tour.passes[v]),
                 "loops": int(tour.loops[v]),
             }
-            for v in used
+            for v in range(1, subtree.n_vertices)
+            if tour.passes[v] > 0
         ],
     }

@@ -185,10 +185,9 @@ def design_choices(answer: TubeAnswer) -> tuple[stage.DesignProposal, tuple[stag
     def rank(each: stage.DesignProposal) -> tuple[float, float, float]:
         return max(enough - each.tip_offset_mm, 0.0), each.lateral_sweep_mm, each.tip_angle_rad
 
-    lengths = {each.tubes.inner.curved_length_mm for each in found}
     chosen = [
         min((each for each in found if each.tubes.inner.curved_length_mm == length), key=rank)
-        for length in sorted(lengths)
+        for length in sorted({each.tubes.inner.curved_length_mm for each in found})
     ]
     return present, tuple(sorted(chosen, key=lambda each: each.lateral_sweep_mm))
 
@@ -254,11 +253,10 @@ def shapes_record(name: str, shapes: stage.TubeShapes) -> dict[str, Any]:
     """Return what a design can do as plain JSON types: mm, rad."""
     tips = shapes.scope_from_tip
     aside = np.hypot(tips[:, 0, 3], tips[:, 1, 3])
-    turned = np.arccos(np.clip(tips[:, 2, 2], -1.0, 1.0))
     largest = {
         "tip_aside_mm": aside,
         "tip_ahead_mm": tips[:, 2, 3],
-        "tip_turned_rad": turned,
+        "tip_turned_rad": np.arccos(np.clip(tips[:, 2, 2], -1.0, 1.0)),
         **{cost: getattr(shapes, cost) for cost in COSTS},
     }
     return {

@@ -263,8 +263,7 @@ class _Inserter:
         moved = (attempt.target_lps - self.query.target)[None]
         border_mm = attempt.errors.border_mm
         flags = int(self._assessor.follow(start[None], chain[None], len(tubes), moved, border_mm).touched[0])
-        structures = self._assessor.structures
-        touched = tuple(name for name in self._assessor.forbidden if flags & structures[name])
+        touched = tuple(name for name in self._assessor.forbidden if flags & self._assessor.structures[name])
         frames, lengths = poses.poses_on_pieces(end, needle[:, :3], SHOWN_STEP_MM)
         error = float(np.linalg.norm(frames[-1][:3, 3] - attempt.target_lps))
         stopped = None if steered is None else steered.stopped

@@ -521,14 +521,13 @@ class Policy:
             obstacles, limits = self.environment.obstacles, self.environment.limits
         judged = judging(plan, lung)
         forbidden = sum(self.assessor.structures[name] for name in self.assessor.forbidden)
-        tubes = self.procedure.tubes.measured
         return kernel.Scene(
             around=spread.around(lung, with_fissures=fissures), obstacles=obstacles, limits=limits,
             judged=Obstacles(every.corners, lung.labels, every.geometry, obstacle_bits(lung.has_fissures)),
             forbidden=forbidden, depth=judged.depth, depth_geometry=judged.geometry,
             mediastinal=judged.mediastinal, radius=self.assessor.radius_mm,
             aside=self.aside_mm, with_needle=plan.needle is not None,
-            replanned=tubes or self.procedure.needle.closed_loop,
+            replanned=self.procedure.tubes.measured or self.procedure.needle.closed_loop,
         )  # fmt: skip
 
     @cached_property

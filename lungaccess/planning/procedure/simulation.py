@@ -240,8 +240,7 @@ class _Run:
             # Tubes that were drawn back again may have stayed in the airway: nothing came of it.
             starts, own = went.starts[back], np.ascontiguousarray(tubes[back])
             moved = errors.target_mm[back], errors.border_mm[back]
-            alone = self.assessor.follow(starts, own, n_tube, *moved).touched
-            touched[back] = alone & ~kernel.STAYS_INSIDE
+            touched[back] = self.assessor.follow(starts, own, n_tube, *moved).touched & ~kernel.STAYS_INSIDE
         found.touched[at] |= touched
         found.miss_mm[at[done]], found.taken[at[done]] = outcomes.miss_mm[done], outcomes.taken[done]
         found.ends[at[done]], found.shifts_mm[at[done]] = outcomes.ends[done], errors.target_mm[done]

@@ -173,11 +173,10 @@ def divided_space(
 
     The `passable` of the environment does not count; `between` is called now and then.
     """
-    counts = [len(piece.cones) for piece in pieces]
     arrays = Pieces(
         frames=np.array([piece.frame for piece in pieces]).reshape(-1, 3, 3),
         cones=np.concatenate([np.zeros((0, 7)), *(piece.cones for piece in pieces)]),
-        first_cone=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        first_cone=np.concatenate([[0], np.cumsum([len(piece.cones) for piece in pieces])]).astype(np.int64),
     )
     boxes, owners = _first_boxes(tubes, float(insertions.max()), pieces)
     looked = 0
@@ -231,8 +230,7 @@ def _first_boxes(tubes: Float, longest: float, pieces: Sequence[PlacePiece]) -> 
         least, greatest = piece.places
         each[:, PLACE_X:HALF] = 0.5 * (least + greatest)
         each[:, HALF + PLACE_X :] = 0.5 * (greatest - least)
-    owners = np.repeat(np.arange(len(pieces), dtype=np.int32), len(ranges))
-    return boxes.reshape(-1, BOX_COLUMNS), owners
+    return boxes.reshape(-1, BOX_COLUMNS), np.repeat(np.arange(len(pieces), dtype=np.int32), len(ranges))
 
 
 def _measures(boxes: Float) -> Float:

@@ -144,10 +144,9 @@ class Geometry:
         """
         count = self._layout.tube_points
         places = [self.exit + (self.inner - self.exit) * m / (count - 1) for m in range(count)]
-        shares = [self._thicker_mm(s) for s in places]
         return (
             [self.tube_point(s) for s in [*places, casadi.fmax(self.outer, self.exit)]],
-            [*shares, self._thicker_mm(self.exit)],
+            [*[self._thicker_mm(s) for s in places], self._thicker_mm(self.exit)],
         )
 
     def in_tissue(self) -> tuple[list[Any], list[Any]]:

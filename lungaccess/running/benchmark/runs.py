@@ -146,8 +146,7 @@ def posed_in_lung(lung: Organ, system: System) -> Pose:
     """Return what poses queries by our rules: those of `lungaccess needle` with a system."""
 
     def pose(published: PublishedQuery, radius_mm: float) -> tuple[NeedleEnvironment, Query]:
-        device = system.require_needle("A query of the needle")
-        needle = replace(device, max_curvature_per_mm=1.0 / radius_mm)
+        needle = replace(system.require_needle("A query of the needle"), max_curvature_per_mm=1.0 / radius_mm)
         asked = needle_question(
             lung, replace(system, needle=needle), published.lps_from_start, published.target_lps
         )

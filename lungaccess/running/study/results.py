@@ -331,7 +331,6 @@ def problem_row(problem: Problem, experiment: int) -> dict[str, Any]:
 
 def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str, Any]:
     """Return a run as a row."""
-    first = answer.improvements[0].time_s if answer.improvements else None
     return {
         "experimentid": experiment,
         "plannerid": planner,
@@ -342,7 +341,7 @@ def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str
         "correct_solution": answer.accepted,
         "status": answer.status,
         "cpu_time": answer.cpu_s,
-        "first_solution_time": first,
+        "first_solution_time": answer.improvements[0].time_s if answer.improvements else None,
         "solutions": len(answer.improvements),
         "seed": run.seed,
         "cost": answer.costs.get(run.problem.objective),

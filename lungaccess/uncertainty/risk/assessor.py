@@ -165,8 +165,7 @@ class RiskAssessor:
         inputs, found = self._inputs(deviations), Outcomes.unknown(deviations.count)
 
         def find(part: slice) -> None:
-            own = (each[part] for each in found)
-            find_outcomes(*inputs, self._obstacles, self.wanted, part.start, *own)
+            find_outcomes(*inputs, self._obstacles, self.wanted, part.start, *(each[part] for each in found))
 
         in_threads(find, deviations.count)
         return found

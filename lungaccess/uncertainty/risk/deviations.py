@@ -185,7 +185,6 @@ def tube_values(
 ) -> Float:
     """Return what a kernel has to know of planar tubes `(11,)`, see `chain.Devices`."""
     longest = tubes.max_extension_mm
-    outer_longest = longest if tubes.outer is None else min(longest, tubes.outer.length_mm)
     return np.array(
         [
             rotation_rad,
@@ -198,7 +197,7 @@ def tube_values(
             tubes.free_curvature_per_mm,
             tubes.outermost.radius_mm + sweep_mm,
             tubes.inner.radius_mm + sweep_mm,
-            outer_longest,
+            longest if tubes.outer is None else min(longest, tubes.outer.length_mm),
         ]
     )
 

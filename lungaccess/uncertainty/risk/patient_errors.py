@@ -223,8 +223,7 @@ def _at_place(model: errors.ErrorModel, plan: Plan, lung: Lung) -> errors.ErrorM
             remedy="Segment the lobes with `lungaccess segment`, or leave out `lobe`",
         )
     tip, tree = np.asarray(plan.scope.lps_from_scope_tip)[:3, 3], lung.tree
-    branch = tree.branch_of_point[tree.nearest_point(tip)]
-    return model.at(lung.lobe_at(tip), int(tree.generation[branch]))
+    return model.at(lung.lobe_at(tip), int(tree.generation[tree.branch_of_point[tree.nearest_point(tip)]]))
 
 
 def _size_mm(motion: Motion, plan: Plan) -> float:

@@ -190,8 +190,7 @@ def _directions(name: str, n: int) -> Float:
         return np.array([[-1.0], [1.0]])
     signs = (-1.0, 1.0)
     single = [sign * row for row in np.eye(n) for sign in signs]
-    joint = [sign * np.ones(n) for sign in signs]
-    return np.array(single + (joint if n > 1 else []))
+    return np.array(single + ([sign * np.ones(n) for sign in signs] if n > 1 else []))
 
 
 OFFSET_MM, TILT_DEG = 5.0, 15.0

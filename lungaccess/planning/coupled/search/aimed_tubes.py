@@ -117,8 +117,7 @@ def nearest_of_each_tip(atlas: Atlas, entries: Int, away_mm: Float) -> Int:
     Where tubes are turned one against the other, it is the nearest of each tip and relative rotation.
     """
     ordered = entries[np.argsort(away_mm, kind="stable")]
-    shapes = shapes_of(atlas.system.tubes)
-    turns = np.unique(shapes.rotations_rad, axis=0, return_inverse=True)[1].ravel()
+    turns = np.unique(shapes_of(atlas.system.tubes).rotations_rad, axis=0, return_inverse=True)[1].ravel()
     kinds = atlas.deployments.site[ordered] * (turns.max(initial=0) + 1)
     kinds += turns[atlas.deployments.shape[ordered]]
     _kinds, first = np.unique(kinds, return_index=True)

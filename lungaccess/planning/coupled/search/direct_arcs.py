@@ -73,8 +73,7 @@ class DirectArcs:
         """
         found = np.zeros(len(chosen), dtype=np.int64), np.zeros(len(chosen)), np.zeros(len(chosen))
         for rows, aim in self._by_aim(chosen):
-            starts = self._starts(chosen[rows])
-            parts = direct_arcs(environment or self.evaluator.environment, *starts, aim)
+            parts = direct_arcs(environment or self.evaluator.environment, *self._starts(chosen[rows]), aim)
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = part
         return found
@@ -122,8 +121,7 @@ class DirectArcs:
     def candidate(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas in full with its arc, None if the tubes are refused."""
         entries = self.atlas.deployments
-        tip = self.atlas.motions.tip(int(entries.site[entry]))
-        return self.evaluator.direct(tip, *entries.choice(entry))
+        return self.evaluator.direct(self.atlas.motions.tip(int(entries.site[entry])), *entries.choice(entry))
 
     def proved(self, entry: int) -> Candidate | None:
         """Return a deployment of the atlas with its arc, None if the proof fails."""

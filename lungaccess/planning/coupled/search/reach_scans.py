@@ -155,8 +155,7 @@ class WindowReachScan(_PointByPoint):
         self._field = lung.obstacle_field(with_fissures=atlas.with_fissures)
 
     def _best(self, point: Float) -> tuple[int, float, float, float] | None:
-        target = Target(lps_mm=point, origin="point")
-        task = Task(lung=self._lung, system=self._atlas.system, target=target)
+        task = Task(lung=self._lung, system=self._atlas.system, target=Target(lps_mm=point, origin="point"))
         search, best = window_search(task, self._atlas, self._phases, widest=False), None
         for step in search.direct_steps():
             best = best if step.candidate is None else step

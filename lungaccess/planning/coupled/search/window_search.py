@@ -219,8 +219,7 @@ class WindowAims:
             aim = evaluator.aim_from(np.ascontiguousarray(atlas.motions.tips[site, :3]))
             found[site] = *aim.point_lps, aim.least_miss_mm, aim.allowed_mm, aim.most_share
         misses, allowed = found[:, 3], found[:, 4]
-        ruled_out = np.where(misses > allowed, misses, 0.0)
-        return cls(points=found[:, :3], misses_mm=ruled_out, shares=found[:, 5])
+        return cls(points=found[:, :3], misses_mm=np.where(misses > allowed, misses, 0.0), shares=found[:, 5])
 
     @property
     def reached(self) -> Float:

@@ -42,8 +42,7 @@ def pieces_of_arcs(arcs: Float, rotation_rad: float) -> Float:
     Arcs shorter than SHORTEST_ARC_MM are left out; `rotation_rad` turns all tubes together.
     """
     kept = arcs[arcs[:, 0] > SHORTEST_ARC_MM]
-    rolls = np.diff(kept[:, 1], prepend=-rotation_rad)
-    return np.stack([kept[:, 0], rolls, kept[:, 2]], axis=1)
+    return np.stack([kept[:, 0], np.diff(kept[:, 1], prepend=-rotation_rad), kept[:, 2]], axis=1)
 
 
 def points_on_arcs(
@@ -57,7 +56,6 @@ def points_on_arcs(
     place = np.clip(np.searchsorted(begins, at_mm, side="right") - 1, 0, len(pieces) - 1)
     for number, (length, roll, curvature) in enumerate(pieces):
         here = place == number
-        along = np.append(at_mm[here] - begins[number], length)
-        poses = poses_on_arc(frame, roll, curvature, along)
+        poses = poses_on_arc(frame, roll, curvature, np.append(at_mm[here] - begins[number], length))
         points[here], frame = poses[:-1, :3, 3], poses[-1]
     return points

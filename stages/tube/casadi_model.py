@@ -114,10 +114,9 @@ class OrderedTubes:
         """
         base, beta = self._symbols("base_angles_rad")
         tip = casadi.MX.sym("tip_angles_rad", len(self._tubes))
-        residual = self._integrate(tip, beta)[0] - base
-        problem = {"x": tip, "p": casadi.vertcat(base, beta), "g": residual}
-        newton = casadi.rootfinder("tip_angles", "newton", problem, _NEWTON)
-        found = newton(x0=tip, p=casadi.vertcat(base, beta))["x"]
+        given = casadi.vertcat(base, beta)
+        problem = {"x": tip, "p": given, "g": self._integrate(tip, beta)[0] - base}
+        found = casadi.rootfinder("tip_angles", "newton", problem, _NEWTON)(x0=tip, p=given)["x"]
         _, position, rotation, determinant = self.forward(found, beta)
         return casadi.Function(
             "equilibrium",
@@ -174,8 +173,7 @@ class OrderedTubes:
         return angles + beta * rates, -rotation @ state[POSITION], rotation
 
     def _step(self, passed: Sequence[int]) -> Any:
-        """Return the Runge-Kutta step, state and mm -> state, in a piece that has `passed` landmarks of each
-        tube ahead."""
+        """Return the Runge-Kutta step, state and mm -> state, of a piece with `passed` landmarks ahead."""
         state, length = casadi.SX.sym("state", FIRST_ANGLE + 2 * len(self._tubes)), casadi.SX.sym("step_mm")
         bending, rest = [], []
         for tube, marks, count in zip(self._tubes, self._marks, passed, strict=True):
@@ -183,8 +181,7 @@ class OrderedTubes:
             rest.append(rest_curvature_per_mm(tube, marks, len(marks) - count))
         twisting = [tube.torsional_stiffness_n_mm2 for tube in self._tubes]
         rate = casadi.Function("rate", [state], [state_rates(state, bending, twisting, rest)])
-        after = runge_kutta(rate, state, length)
-        return casadi.Function("step", [state, length], [after])
+        return casadi.Function("step", [state, length], [runge_kutta(rate, state, length)])
 
 
 class CasadiTubes:

@@ -25,10 +25,8 @@ def landmarks_mm(tube: Tube) -> list[float]:
     """Return the ascending arc lengths from the base at which precurvature or slots change, and the end."""
     ends = {end for bend in tube.bends for end in (bend.from_mm, bend.to_mm)}
     for segment in tube.slotted_segments:
-        ends |= {
-            tube.length_mm - segment.from_tip_mm,
-            tube.length_mm - segment.from_tip_mm - segment.length_mm,
-        }
+        front = tube.length_mm - segment.from_tip_mm
+        ends |= {front, front - segment.length_mm}
     return [*sorted(end for end in ends if SAME_MM < end < tube.length_mm - SAME_MM), tube.length_mm]
 
 
@@ -62,19 +60,15 @@ def bending_n_mm2(tube: Tube, marks: Sequence[float], index: int) -> float:
     return 1e3 * tube.youngs_modulus_gpa * area * next(shares, 1.0)
 
 
-def state_rates(
-    state: Any, bending: Sequence[float], twisting: Sequence[float], rest: Sequence[Float]
-) -> Any:
+def state_rates(state: Any, bending: Sequence[float], torsion: Sequence[float], rest: Sequence[Float]) -> Any:
     """Return the derivative of the state by the arc length [Rucker2010]."""
     n = len(bending)
     relative = [casadi.SX(0), *casadi.vertsplit(state[FIRST_ANGLE + 1 : FIRST_ANGLE + n])][:n]
-    rates = [state[FIRST_ANGLE + n + i] / twisting[i] for i in range(n)]
+    rates = [state[FIRST_ANGLE + n + i] / torsion[i] for i in range(n)]
     turns = [about_z(angle)[:2, :2] for angle in relative]
     shared = sum(bending[i] * turns[i] @ rest[i] for i in range(n)) / sum(bending)
-    moments = []
-    for i in range(n):
-        own = turns[i].T @ shared
-        moments.append(bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]))
+    owns = [turn.T @ shared for turn in turns]
+    moments = [bending[i] * (own[0] * rest[i][1] - own[1] * rest[i][0]) for i, own in enumerate(owns)]
     spin = spin_of(state[ROTATION], shared[0], shared[1], rates[0])
     others = [rates[i] - rates[0] for i in range(1, n)]
     return casadi.vertcat(forward_of(state[ROTATION]), spin, rates[0], *others, *moments)

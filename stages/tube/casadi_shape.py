@@ -169,10 +169,8 @@ class _Shooting:
 
     def _carried(self, unknown: Any, reference: Any, share: Any) -> Any:
         """Return the states after each step, from the tip on."""
-        n = len(self._tubes)
-        rest = casadi.MX.zeros(n)
-        tip = casadi.vertcat(unknown[:7], casadi.MX.zeros(6), unknown[7:], rest, reference, rest)
-        states, state = [], tip
+        rest, states = casadi.MX.zeros(len(self._tubes)), []
+        state = casadi.vertcat(unknown[:7], casadi.MX.zeros(6), unknown[7:], rest, reference, rest)
         for (far, near), tissue in zip(self._pieces, self._tissue, strict=True):
             step = self._step(0.5 * (far + near), tissue)
             shares, length = casadi.repmat(share, 1, STEPS), casadi.DM([(near - far) / STEPS])
@@ -186,8 +184,7 @@ class _Shooting:
         state, length = casadi.SX.sym("state", FIRST_ANGLE + 4 * n + 7), casadi.SX.sym("step_mm")
         share = casadi.SX.sym("share")
         rate = casadi.Function("rate", [state, share], [self._rates(state, share, middle, tissue)])
-        after = runge_kutta(rate, state, length, share)
-        return casadi.Function("step", [state, length, share], [after])
+        return casadi.Function("step", [state, length, share], [runge_kutta(rate, state, length, share)])
 
     def _rates(self, state: Any, share: Any, middle: float, tissue: float) -> Any:
         """Return the derivative of the state by arc length [Rucker2011]."""
@@ -205,9 +202,7 @@ class _Shooting:
         off = loaded[POSITION] - before[POSITION]
         across = off - ahead_before * casadi.dot(ahead_before, off)
         # A vector in the frame of a quaternion.
-        quaternion = loaded[ROTATION]
-        vector = loaded[MOMENT]
-        axis, w = -quaternion[1:], quaternion[0]
+        vector, w, axis = loaded[MOMENT], loaded[ROTATION][0], -loaded[ROTATION][1:]
         aside = 2 * casadi.cross(axis, vector)
         local = vector + w * aside + casadi.cross(axis, aside)
         rates = []
@@ -245,13 +240,10 @@ class DerivedShape:
     Args:
         arc_lengths_mm ((N,) float64): From the scope tip, rising from 0.
         points_mm ((N, 3) float64): Of the centreline, in the frame of the scope tip.
-        relative_rad ((N, n - 1) float64): Angles of the tubes around the innermost, relative to it, where
-            they are.
+        relative_rad ((N, n - 1) float64): Angles of the tubes around the innermost where they are, less its.
         base_from_tip ((4, 4) float64): Material frame of the innermost tube at its end.
-        way (tuple of (K, 4) float64): Arc lengths and points, mm, of every step of the way, the last of which
-            is the deployment.
-        least_determinant: Least on the way of the derivative of base angles by tip angles: above 0 the tubes
-            nowhere snap.
+        way (tuple of (K, 4) float64): Arc lengths and points, mm, of every step; the last is the deployment.
+        least_determinant: Least derivative of base by tip angles on the way: above 0 the tubes nowhere snap.
     """
 
     arc_lengths_mm: Float
@@ -286,10 +278,8 @@ def derive_shape(
         # Its rear end goes with that of the innermost tube, and it has no torsion: its angle stays 0.
         behind = betas[:, :1] + (tubes[0].length_mm - needle.length_mm)
         betas, angles = np.hstack([behind, betas]), np.hstack([np.zeros_like(behind), angles])
-        tubes, turned = (
-            (replace(needle, length_mm=needle.length_mm + BEYOND_MM), *tubes),
-            np.append(0.0, turned),
-        )
+        tubes = (replace(needle, length_mm=needle.length_mm + BEYOND_MM), *tubes)
+        turned = np.append(0.0, turned)
     model = CasadiTubes(tubes)
     tips, least, before = turned, 1.0, betas[moves == 0][-1]
     way = []

@@ -116,20 +116,18 @@ def enumerate_deployments(
     with_fissures: bool,
     rotations: int = DEFAULT_ROTATIONS,
     stop_spacing_mm: float = DEFAULT_STOP_MM,
-    worthwhile: Callable[[Float, Float], Bool] | None = None,
+    worthwhile: "OfUse | None" = None,
     progress: Callable[[float], None] | None = None,
     enumerator: "SiteEnumerator | None" = None,
 ) -> Deployments:
     """Enumerate what the tubes can do from many scope tips: the shapes of the design that leave safely.
 
     Args:
-        scope_tips ((S, 9) float64): Point, direction and +x of the frame of each scope tip, LPS mm; rotations
-            count from that +x.
+        scope_tips ((S, 9) float64): Point, direction and +x of scope tips, LPS mm; rotations count from +x.
         rotations: Evenly spaced rotations of the tubes.  Where no tube is turned against another, a further
             one is looked at between two of them where not the same shapes are accepted at both: there the
             tube or its exit is near a limit.
-        worthwhile: Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are
-            of use; no others are looked at, but those between two rotations always are.
+        worthwhile: No others are looked at, but those between two rotations always are.
         progress: Told the share of sites done.
         enumerator: Made of the others if None.
     """
@@ -153,7 +151,9 @@ def enumerate_deployments(
     return _joined([enumerator.none, *parts], np.arange(-1, len(tips)))
 
 
-Enumerator = Callable[[Float, Callable[[Float, Float], Bool]], Deployments]
+OfUse = Callable[[Float, Float], Bool]
+"""Tells from positions and tangents `(N, 3)` of tips, LPS mm, which `(N,)` deployments are of use."""
+Enumerator = Callable[[Float, OfUse], Deployments]
 """Returns the deployments from a scope tip `(9,)` that are of use; see `enumerate_deployments`."""
 
 
@@ -168,8 +168,7 @@ class SiteEnumerator:
 
     Args:
         enough: Where more deployments are of use, fewer rotations are looked at.
-        at_stops: Numbers, set and tree of the shapes that are placed; `coarser_shapes` of the design's if
-            None.
+        at_stops: Numbers, set and tree of the shapes that are placed; by default the design's, made coarser.
     """
 
     def __init__(
@@ -188,21 +187,17 @@ class SiteEnumerator:
         self._rotations = rotations if any(tube.bends for tube in tubes.nested) else 1
         self._members, self._shapes, tree = at_stops or coarser_shapes(shapes_of(tubes), stop_spacing_mm)
         self._tree, self._depth = tree.with_margin(margins.total_mm), int(tree.depth.max(initial=0))
-        coarse: Float = np.arange(self._rotations, dtype=np.float64) * (2 * math.pi / self._rotations)
+        even: Float = np.arange(self._rotations, dtype=np.float64) * (2 * math.pi / self._rotations)
         self._between = not self._shapes.rotations_rad.any()
-        self.angles = (
-            np.concatenate([coarse, coarse + math.pi / self._rotations]) if self._between else coarse
-        )
+        self.angles = np.concatenate([even, even + math.pi / self._rotations]) if self._between else even
         self._turns = _about_z(self.angles)
         self._environment = tube_environment(lung, with_fissures=with_fissures)
         self._constants = tube_constants(tubes, margins)
         empty = np.zeros((0, placing.PLACED_COLUMNS)), np.zeros(0, dtype=np.int64)
         refused = np.zeros((0, kernels.N_REASONS), dtype=np.int64)
-        self.none = self._as_deployments(np.eye(4), *empty, refused, np.zeros(0, dtype=np.int64))
+        self.none = self._placed(np.eye(4), *empty, refused, np.zeros(0, dtype=np.int64))
 
-    def deployments(
-        self, tip: Float, worthwhile: Callable[[Float, Float], Bool] | None = None
-    ) -> Deployments:
+    def deployments(self, tip: Float, worthwhile: OfUse | None = None) -> Deployments:
         """Return the deployments from one scope tip `(9,)`, those of use alone where that can be told."""
         frame = frames.pose(tip[:3], tip[3:6], tip[6:])
         refused = np.zeros(kernels.N_REASONS, dtype=np.int64)
@@ -228,9 +223,9 @@ class SiteEnumerator:
             rows, turn_of = np.concatenate([rows, more]), np.concatenate([turn_of, of_more])
             turns = np.concatenate([turns, further])
         looked_at = np.array([np.count_nonzero(wanted[turns])], dtype=np.int64)
-        return self._as_deployments(frame, rows, turn_of, refused[None], looked_at)
+        return self._placed(frame, rows, turn_of, refused[None], looked_at)
 
-    def _of_use(self, frame: Float, worthwhile: Callable[[Float, Float], Bool]) -> Bool:
+    def _of_use(self, frame: Float, worthwhile: OfUse) -> Bool:
         """Return which shapes `(T, S)` are of use, from few enough rotations: those between come last."""
         tips = (frame @ self._turns)[:, None] @ self._shapes.scope_from_tip
         at, towards = (np.ascontiguousarray(tips[..., :3, column].reshape(-1, 3)) for column in (3, 2))
@@ -248,9 +243,7 @@ class SiteEnumerator:
         accepted[turn_of, rows[:, placing.PLACED_SHAPE].astype(np.int64)] = True
         return np.flatnonzero((accepted != np.roll(accepted, -1, axis=0)).any(axis=1))
 
-    def _as_deployments(
-        self, frame: Float, rows: Float, turn_of: Int, refused: Int, looked_at: Int
-    ) -> Deployments:
+    def _placed(self, frame: Float, rows: Float, turn_of: Int, refused: Int, looked_at: Int) -> Deployments:
         shape = rows[:, placing.PLACED_SHAPE].astype(np.int64)
         lps = frame @ self._turns[turn_of] @ self._shapes.scope_from_tip[shape]
         return Deployments(

@@ -37,8 +37,7 @@ class ShapeTree:
         depth, skip ((M,) int64): Level from 1 on; the node to go on with where this one is refused.
         first ((M + 1,) int64): Where the `stretches` of each node begin.
         stretches ((R, 12) float64): See `stages.tube.kernels.placing`.
-        radius, clearance ((M,) float64): Outermost radius; what has to be free beside it and the margins, for
-            sweep and tolerance; mm.
+        radius, clearance ((M,) float64): Outermost radius; what sweep and tolerance need beside it; mm.
         first_shape ((M + 1,) int64): Where the `shapes` (S,) begin that end with each node.
     """
 
@@ -74,14 +73,14 @@ def tree_of_shapes(shapes: TubeShapes, *, tolerance_mm: float | None = None) -> 
     radii = np.zeros((shapes.count, most + 1))
     cut = [np.zeros((0, placing.STRETCH_COLUMNS))] * shapes.count
     room = np.zeros((most + int(np.diff(shapes.first_arc).max(initial=0)) + 1, placing.STRETCH_COLUMNS))
-    for shape in range(shapes.count):
-        rows = placing.cut_at_stops(
-            shapes.arcs_of(shape), stop, room, ends[shape], middles[shape], radii[shape]
-        )
-        cut[shape] = room[:rows].copy()
+    for n in range(shapes.count):
+        rows = placing.cut_at_stops(shapes.arcs_of(n), stop, room, ends[n], middles[n], radii[n])
+        cut[n] = room[:rows].copy()
     groups, sweeps = _sweep_classes(shapes)
     nodes, errors, leaf = _grown(places, groups, ends, middles, radii, tolerance_mm)
-    return _in_order(shapes, cut, stop, nodes, errors, leaf, radii, sweeps[groups])
+    firsts, places = nodes[:, 2], nodes[:, 1]
+    clearance = sweeps[groups][firsts] + errors
+    return _in_order(shapes, cut, nodes, leaf, radii[firsts, places], clearance)
 
 
 def _sweep_classes(shapes: TubeShapes) -> tuple[Int, Float]:
@@ -107,23 +106,18 @@ def _grown(
 
 
 def _in_order(
-    shapes: TubeShapes,
-    cut: list[Float],
-    stop: float,
-    nodes: Int,
-    errors: Float,
-    leaf: Int,
-    radii: Float,
-    sweeps: Float,
+    shapes: TubeShapes, cut: list[Float], nodes: Int, leaf: Int, radius: Float, clearance: Float
 ) -> ShapeTree:
-    """Return the tree with its nodes in the order in which they are followed."""
-    count = len(nodes)
+    """Return the tree with its nodes as they are followed; errors of arcs are added to the clearances."""
+    count, stop = len(nodes), shapes.stop_mm
     parents, places, firsts = nodes[:, 0], nodes[:, 1], nodes[:, 2]
     ending = np.bincount(leaf, minlength=count)
-    size = np.ones(count, dtype=np.int64)
+    size, arc_errors = np.ones(count, dtype=np.int64), np.zeros(count)
+    np.maximum.at(arc_errors, leaf, shapes.arc_error_mm)
     for node in range(count - 1, -1, -1):  # children come after their parents
         if parents[node] >= 0:
             size[parents[node]] += size[node]
+            arc_errors[parents[node]] = max(arc_errors[parents[node]], arc_errors[node])
     rank, room = np.zeros(count, dtype=np.int64), np.zeros(count + 1, dtype=np.int64)
     for node in range(count):
         rank[node] = room[parents[node] + 1]
@@ -132,18 +126,13 @@ def _in_order(
     order = np.argsort(rank)
     stop_of = [np.floor((rows[:, placing.BEGINS] + STILL_MM) / stop).astype(np.int64) + 1 for rows in cut]
     own = [cut[firsts[node]][stop_of[firsts[node]] == places[node]] for node in order]
-    arc_errors = np.zeros(count)
-    np.maximum.at(arc_errors, leaf, shapes.arc_error_mm)
-    for node in range(count - 1, -1, -1):
-        if parents[node] >= 0:
-            arc_errors[parents[node]] = max(arc_errors[parents[node]], arc_errors[node])
     return ShapeTree(
         depth=read_only(places[order]),
         skip=read_only((rank + size)[order]),
         first=read_only(np.concatenate([[0], np.cumsum([len(rows) for rows in own])]).astype(np.int64)),
         stretches=read_only(np.concatenate([np.zeros((0, placing.STRETCH_COLUMNS)), *own])),
-        radius=read_only(radii[firsts, places][order]),
-        clearance=read_only((sweeps[firsts] + errors + arc_errors)[order]),
+        radius=read_only(radius[order]),
+        clearance=read_only((clearance + arc_errors)[order]),
         first_shape=read_only(np.concatenate([[0], np.cumsum(ending[order])]).astype(np.int64)),
         shapes=read_only(np.argsort(rank[leaf], kind="stable").astype(np.int64)),
     )
@@ -167,8 +156,8 @@ def shapes_at_hand(tubes: ConcentricTubes) -> bool:
     nested = tubes.nested
     if sum(bool(tube.bends) for tube in nested) <= 1:
         return True
-    design = _design(nested, _limits(tubes), _grid(nested), tubes.needle_shaft)
-    return record_path("shapes", shapes_format(), design).is_file()
+    key = _key(nested, _limits(tubes), _grid(nested), tubes.needle_shaft)
+    return record_path("shapes", shapes_format(), key).is_file()
 
 
 def _limits(tubes: ConcentricTubes) -> ShapeLimits:
@@ -180,9 +169,7 @@ def _limits(tubes: ConcentricTubes) -> ShapeLimits:
     )
 
 
-def _design(
-    tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid, needle: Tube | None
-) -> dict[str, Any]:
+def _key(tubes: Sequence[Tube], limits: ShapeLimits, grid: ShapeGrid, needle: Tube | None) -> dict[str, Any]:
     return {
         "tubes": [to_mapping(tube) for tube in tubes],
         "limits": to_mapping(limits),
@@ -201,8 +188,7 @@ def coarser_shapes(shapes: TubeShapes, stop_mm: float) -> tuple[Int, TubeShapes,
 
     Where the stops are twice as far apart as in the set or more, so are the relative rotations.
     """
-    stride = max(round(stop_mm / shapes.stop_mm), 1)
-    return _coarser(shapes, stride)
+    return _coarser(shapes, max(round(stop_mm / shapes.stop_mm), 1))
 
 
 def shapes_digest(tubes: ConcentricTubes) -> str:
@@ -259,6 +245,5 @@ def open_shapes(
     `anatomy.kept_records.kept_record`.
     """
     limits, grid = limits or ShapeLimits(), grid or ShapeGrid.default(tubes)
-    design = _design(tubes, limits, grid, needle)
-    made = partial(tube_shapes, tubes, limits, grid, needle=needle)
-    return kept_record("shapes", shapes_format(), design, TubeShapes, make=made, cache=cache)
+    key, made = _key(tubes, limits, grid, needle), partial(tube_shapes, tubes, limits, grid, needle=needle)
+    return kept_record("shapes", shapes_format(), key, TubeShapes, make=made, cache=cache)

@@ -23,11 +23,9 @@ class TubeParts(NamedTuple):
 
     Args:
         begin_mm, end_mm ((K,) float64): Places along the tube, counted from its tip.
-        curvature_per_mm, direction_rad ((K,) float64): Precurvature, and its direction about the axis, 0
-            where it is straight.
+        curvature_per_mm, direction_rad ((K,) float64): Precurvature and its direction, 0 where straight.
         stiffness_n_mm2 ((K,) float64): Bending stiffness.
-        strained_radius_mm ((K,) float64): Strain for each 1/mm of change of curvature: the radius by the
-            factor of the slots.
+        strained_radius_mm ((K,) float64): Strain for each 1/mm of change of curvature: radius by slot factor.
     """
 
     begin_mm: Float
@@ -129,38 +127,30 @@ class Tube:
 
     def __post_init__(self) -> None:
         if self.inner_diameter_mm >= self.outer_diameter_mm:
-            raise impossible(
-                "inner_diameter_mm",
-                self.inner_diameter_mm,
-                f"less than outer_diameter_mm = {self.outer_diameter_mm:g}",
-            )
-        if self.curved_length_mm > self.length_mm:
-            raise impossible(
-                "curved_length_mm", self.curved_length_mm, f"at most length_mm = {self.length_mm:g}"
-            )
+            allowed = f"less than outer_diameter_mm = {self.outer_diameter_mm:g}"
+            raise impossible("inner_diameter_mm", self.inner_diameter_mm, allowed)
+        curved_mm, length = self.curved_length_mm, f"length_mm = {self.length_mm:g}"
+        if curved_mm > self.length_mm:
+            raise impossible("curved_length_mm", curved_mm, f"at most {length}")
         pieces_mm = sum(piece.length_mm for piece in self.bent_pieces)
-        if self.bent_pieces and self.curved_length_mm > 0.0:
-            raise impossible(
-                "curved_length_mm", self.curved_length_mm, "0 where bent_pieces say how the tube is curved"
-            )
+        if self.bent_pieces and curved_mm > 0.0:
+            raise impossible("curved_length_mm", curved_mm, "0 where bent_pieces say how the tube is curved")
         if pieces_mm > self.length_mm:
-            raise impossible("bent_pieces", pieces_mm, f"in all at most length_mm = {self.length_mm:g} long")
-        if (self.curved_length_mm > 0.0) != (self.precurvature_per_mm > 0.0):
+            raise impossible("bent_pieces", pieces_mm, f"in all at most {length} long")
+        if (curved_mm > 0.0) != (self.precurvature_per_mm > 0.0):
             raise impossible(
                 "precurvature_per_mm",
                 self.precurvature_per_mm,
                 "above 0 if curved_length_mm is (curved tube), 0 if that is 0 (straight tube); "
-                f"curved_length_mm = {self.curved_length_mm:g}",
+                f"curved_length_mm = {curved_mm:g}",
             )
-
         check_segments(self.slotted_segments, self.length_mm)
 
     @cached_property
     def parts(self) -> TubeParts:
         """The tube cut where its precurvature or its slots change."""
-        return tube_parts(
-            self.length_mm, self.bends, self.slotted_segments, self.bending_stiffness_n_mm2, self.radius_mm
-        )
+        slots, stiffness = self.slotted_segments, self.bending_stiffness_n_mm2
+        return tube_parts(self.length_mm, self.bends, slots, stiffness, self.radius_mm)
 
     def most_bent_per_mm(self, max_strain: float, passing_mm: float) -> float:
         """Return how bent a channel may be that the first `passing_mm` of the tube pass, 1/mm.
@@ -346,11 +336,8 @@ class ConcentricTubes:
 
     def _check_nesting(self) -> None:
         if self.max_extension_mm > self.inner.length_mm:
-            raise impossible(
-                "max_extension_mm",
-                self.max_extension_mm,
-                f"at most inner.length_mm = {self.inner.length_mm:g}",
-            )
+            allowed = f"at most inner.length_mm = {self.inner.length_mm:g}"
+            raise impossible("max_extension_mm", self.max_extension_mm, allowed)
         if self.middle is not None and self.outer is None:
             raise impossible("middle", "there", "left out where there is no tubes.outer")
         for (name, around), (within, tube) in pairwise(self.named):
@@ -363,9 +350,8 @@ class ConcentricTubes:
                     f"min_clearance_mm = {self.min_clearance_mm:g}",
                 )
             if tube.length_mm < around.length_mm:
-                raise impossible(
-                    f"{within}.length_mm", tube.length_mm, f"at least {name}.length_mm = {around.length_mm:g}"
-                )
+                allowed = f"at least {name}.length_mm = {around.length_mm:g}"
+                raise impossible(f"{within}.length_mm", tube.length_mm, allowed)
 
     @property
     def nested(self) -> tuple[Tube, ...]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -96,20 +97,19 @@ def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0)
             expected="one tube or more, the innermost first",
             remedy="Give the tubes, the innermost first",
         )
-    for m in range(len(tubes) - 1):
-        inner, outer = tubes[m], tubes[m + 1]
+    for number, (inner, outer) in enumerate(pairwise(tubes), start=1):
         clearance = outer.inner_diameter_mm - inner.outer_diameter_mm
         if least_clearance_mm is not None and not clearance > max(least_clearance_mm - SAME_MM, 0.0):
             raise SettingsError(
-                f"Tube {m + 1} has an outer diameter of {inner.outer_diameter_mm:g} mm",
-                expected=f"less than the inner diameter of tube {m + 2}, {outer.inner_diameter_mm:g} mm, by "
-                f"{least_clearance_mm:g} mm or more",
+                f"Tube {number} has an outer diameter of {inner.outer_diameter_mm:g} mm",
+                expected=f"less than the inner diameter of tube {number + 1}, {outer.inner_diameter_mm:g} "
+                f"mm, by {least_clearance_mm:g} mm or more",
                 remedy="Make the inner tube thinner, or list the tubes from the inside",
             )
         if inner.length_mm < outer.length_mm:
             raise SettingsError(
-                f"Tube {m + 1} is {inner.length_mm:g} mm long",
-                expected=f"at least the length of tube {m + 2}, {outer.length_mm:g} mm",
+                f"Tube {number} is {inner.length_mm:g} mm long",
+                expected=f"at least the length of tube {number + 1}, {outer.length_mm:g} mm",
                 remedy="Make the inner tube longer, or list the tubes from the inside",
             )
 
@@ -117,20 +117,16 @@ def check_nesting(tubes: Sequence[Tube], least_clearance_mm: float | None = 0.0)
 class Equilibrium:
     """One equilibrium: shape, torsion and stability, made by `TubeMechanics`, which says what is given."""
 
-    def __init__(
-        self, mechanics: NestedTubes, tip_angles_rad: Float, beta_mm: Float, needle_mm: float
-    ) -> None:
-        n = mechanics.count
-        self.mechanics = mechanics
+    def __init__(self, tubes: NestedTubes, tip_angles_rad: Float, beta_mm: Float, needle_mm: float) -> None:
+        self.mechanics = tubes
         self.tip_angles_rad = read_only(tip_angles_rad.copy())
         self.beta_mm = read_only(beta_mm.copy())
         # As the kernels of the search have it: for a read-only array they would be compiled once more.
         self._beta_mm = beta_mm.copy()
-        self._cutting, n_steps = mechanics.cut(
-            mechanics.rear_ends(beta_mm[None], np.array([needle_mm]))[0].copy()
-        )
-        self._nodes, self._steps = equilibrium.scratch_for(n_steps, n, n - 1)
-        torsion.twist(mechanics.design, self._cutting, tip_angles_rad, self._nodes, self._steps)
+        rear_ends = tubes.rear_ends(beta_mm[None], np.array([needle_mm]))[0].copy()
+        self._cutting, n_steps = tubes.cut(rear_ends)
+        self._nodes, self._steps = equilibrium.scratch_for(n_steps, tubes.count, tubes.count - 1)
+        torsion.twist(tubes.design, self._cutting, tip_angles_rad, self._nodes, self._steps)
         self._poses = np.zeros((n_steps + 1, 12))
         pose.lay(self._cutting, self._nodes, self._steps, self._poses)
 
@@ -180,8 +176,7 @@ class Equilibrium:
         """Return rotations `(N, n)` of tubes against the Bishop frame, rad; NaN where a tube is not."""
         s = self._arc_lengths(arc_lengths_mm)
         _poses, psi, rates = self._along(s)
-        behind = np.minimum(s, 0.0)[:, None]
-        return np.where(self._there(s), psi + behind * rates, np.nan)
+        return np.where(self._there(s), psi + np.minimum(s, 0.0)[:, None] * rates, np.nan)
 
     def torsion(self, arc_lengths_mm: ArrayLike) -> Float:
         """Return torsion `(N, n)` of the tubes, rad/mm, NaN where a tube is not."""

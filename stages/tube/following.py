@@ -27,8 +27,7 @@ class SnapError(LungaccessError):
 
     Args:
         move: During which move of the sequence.
-        base_angles_rad, insertions_mm ((n,) float64): First joint values found that cannot be reached,
-            innermost tube first.
+        base_angles_rad, insertions_mm ((n,) float64): First joints found out of reach, innermost tube first.
         last: The last stable equilibrium before them.
     """
 
@@ -110,12 +109,11 @@ def deploy(
             # How often a step is halved before its branch of equilibria is said to end there.
             steps.append(_reach(mechanics, steps[-1], angles[number], beta[number], 12))
         except _BranchEndError as end:
-            lengths = np.array([tube.length_mm for tube in mechanics.tubes])
             raise SnapError(
                 end.why,
                 move=sequence.moves[move[number]],
                 base_angles_rad=read_only(end.base_angles_rad),
-                insertions_mm=read_only(end.beta_mm + lengths),
+                insertions_mm=read_only(end.beta_mm + mechanics.lengths_mm),
                 last=end.last,
             ) from None
     sweep, error = motion_by_step(steps)
@@ -143,42 +141,40 @@ def _first(mechanics: TubeMechanics, angles: Float, beta: Float) -> Equilibrium:
             "the first joint values have no stable equilibrium",
             move="start",
             base_angles_rad=angles,
-            insertions_mm=beta + np.array([tube.length_mm for tube in mechanics.tubes]),
+            insertions_mm=beta + mechanics.lengths_mm,
             last=found,
         )
     return found
 
 
-def _reach(
-    mechanics: TubeMechanics, last: Equilibrium, angles: Float, beta: Float, halvings: int
-) -> Equilibrium:
+def _reach(tubes: TubeMechanics, last: Equilibrium, angles: Float, beta: Float, halvings: int) -> Equilibrium:
     """Return the equilibrium that continues the branch of `last`, in smaller steps where needed."""
-    found, why = _step(mechanics, last, angles, beta)
+    found, why = _step(tubes, last, angles, beta)
     if found is not None:
         return found
     if halvings == 0:
         raise _BranchEndError(why, angles, beta, last)
     half_angles, half_beta = 0.5 * (last.base_angles_rad + angles), 0.5 * (last.beta_mm + beta)
-    middle = _reach(mechanics, last, half_angles, half_beta, halvings - 1)
-    return _reach(mechanics, middle, angles, beta, halvings - 1)
+    middle = _reach(tubes, last, half_angles, half_beta, halvings - 1)
+    return _reach(tubes, middle, angles, beta, halvings - 1)
 
 
-def _step(
-    mechanics: TubeMechanics, last: Equilibrium, angles: Float, beta: Float
-) -> tuple[Equilibrium | None, str]:
+Found = tuple[Equilibrium | None, str]
+
+
+def _step(tubes: TubeMechanics, last: Equilibrium, angles: Float, beta: Float) -> Found:
     """Return the next equilibrium, or None and why it does not continue the branch."""
     turn = angles - last.base_angles_rad
     try:
-        found = mechanics.given_base_angles(angles, beta, guess_rad=last.tip_angles_rad + turn)
+        found = tubes.given_base_angles(angles, beta, guess_rad=last.tip_angles_rad + turn)
         if not found.stable:
             return None, "stability is lost"
         stray = np.abs(found.tip_angles_rad - last.tip_angles_rad - turn).max()
         if stray > LARGEST_STRAY_RAD:
             return None, "they jump to another equilibrium"
         if stray > UNSUSPICIOUS_RAD:
-            back = mechanics.given_base_angles(
-                last.base_angles_rad, last.beta_mm, guess_rad=found.tip_angles_rad - turn
-            )
+            guess = found.tip_angles_rad - turn
+            back = tubes.given_base_angles(last.base_angles_rad, last.beta_mm, guess_rad=guess)
             if np.abs(back.tip_angles_rad - last.tip_angles_rad).max() > SAME_BRANCH_RAD:
                 return None, "they jump to another equilibrium"
     except ConvergenceError:
@@ -210,11 +206,8 @@ def _distance_to_track(points: Float, track: Float) -> Float:
     if len(track) == 1:
         return np.asarray(np.linalg.norm(points - track[0], axis=1))
     _, nearest = cKDTree(track).query(points)
-    both = [
-        _distance_to_segment(points, track[begin], track[begin + 1])
-        for begin in (np.maximum(nearest - 1, 0), np.minimum(nearest, len(track) - 2))
-    ]
-    return np.minimum(*both)
+    begins = np.maximum(nearest - 1, 0), np.minimum(nearest, len(track) - 2)
+    return np.minimum(*(_distance_to_segment(points, track[each], track[each + 1]) for each in begins))
 
 
 def _distance_to_segment(points: Float, a: Float, b: Float) -> Float:

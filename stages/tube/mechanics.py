@@ -39,12 +39,10 @@ class TubeMechanics(NestedTubes):
     Args:
         tubes: One or more, the innermost first.
         needle: A straight needle or wire in the innermost tube, of which only the bending stiffness matters.
-            It ends where that tube does, or anywhere else; what is of it beyond the tubes is no part of their
-            shape.
-        step_rad: Steps span at most this angle of the fastest torsional oscillation: a half of it makes
-            errors 16 times smaller.
-        least_clearance_mm: By how much each tube must be thinner than the bore of the next; None for textbook
-            tubes of any diameter.
+            It ends where that tube does, or anywhere; what is beyond the tubes is no part of their shape.
+        step_rad: Steps span at most this angle of the fastest torsional oscillation; errors go with its 4th
+            power.
+        least_clearance_mm: By how much each tube must be thinner than the next one's bore; None for any size.
 
     Raises:
         SettingsError: If there is no tube, a tube or needle does not fit into the next one or is shorter than

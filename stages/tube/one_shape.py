@@ -36,13 +36,12 @@ THREADS = 2
 def tube_environment(lung: Lung, *, with_fissures: bool) -> TubeEnvironment:
     """Return what the tubes collide with in a lung, its fissures too if they are obstacles."""
     field = lung.obstacle_field(with_fissures=with_fissures)
-    bits = obstacle_bits(with_fissures)
     depth = lung.lumen_depth
     return TubeEnvironment(
         field=field.corners,
         labels=lung.labels,
         geometry=field.geometry,
-        bits=bits,
+        bits=obstacle_bits(with_fissures),
         lumen=depth.corners,
         lumen_geometry=depth.geometry,
         mediastinal=lung.tree.mediastinal,
@@ -246,13 +245,11 @@ class Neighbourhood:
 
         Raises SettingsError if numbers are missing or not finite, or the tubes get out of order.
         """
-        mechanics = self._mechanics
+        mechanics, n = self._mechanics, self._mechanics.count
         out, turned = (np.array(values, dtype=np.float64) for values in (insertions_mm, rotations_rad))
         for name, values in (("insertions", out), ("rotations", turned)):
-            if values.shape != (mechanics.count,) or not np.isfinite(values).all():
-                raise SettingsError(
-                    f"The {name} are {values.tolist()}", expected=f"{mechanics.count} finite numbers"
-                )
+            if values.shape != (n,) or not np.isfinite(values).all():
+                raise SettingsError(f"The {name} are {values.tolist()}", expected=f"{n} finite numbers")
         mechanics.check_shifts((out - mechanics.lengths_mm)[None])
         end = self._rear_ends(out)
         result, tips = np.zeros(columns.SHAPE_COLUMNS), self._tips.copy()

@@ -70,8 +70,7 @@ def least_sweep_sequence(
     deployed, refused = [], {}
     for name, make in _makers(tubes, angles, insertions_mm).items():
         try:
-            sequence = replace(make(), name=name)
-            deployed.append(deploy(mechanics, sequence))
+            deployed.append(deploy(mechanics, replace(make(), name=name)))
         except (SettingsError, SnapError) as error:
             refused[name] = str(error)
     deployed.sort(key=lambda each: each.lateral_sweep_mm)
@@ -104,9 +103,7 @@ class MakerLimits:
     longest_curve_mm: Annotated[
         float, quantity("longest curved part, 0 if only the insertion limits it", at_least=0.0, at_most=500.0)
     ] = 0.0
-    thinnest_wall_mm: Annotated[
-        float, quantity("thinnest wall of the outer tube", above=0.0, at_most=2.0)
-    ] = 0.05
+    thinnest_wall_mm: Annotated[float, quantity("thinnest wall outside", above=0.0, at_most=2.0)] = 0.05
     nesting_clearance_mm: Annotated[
         float, quantity("difference of diameters of bore and inner tube", above=0.0, at_most=2.0)
     ] = 0.15
@@ -180,12 +177,8 @@ def propose_designs(
         replace(uncurved, curved_length_mm=curve_mm, precurvature_per_mm=curvature_per_mm)
         for curve_mm, curvature_per_mm in curves
     ]
-    found = [
-        evaluate_design(
-            replace(tubes, outer=outer, inner=inner).with_needle(tubes.needle_shaft), outer_mm, inner_mm
-        )
-        for outer, inner in product(outers, inners)
-    ]
+    pairs = [replace(tubes, outer=outer, inner=inner) for outer, inner in product(outers, inners)]
+    found = [evaluate_design(pair.with_needle(tubes.needle_shaft), outer_mm, inner_mm) for pair in pairs]
     kept = _worth_a_look([each for each in found if each.lateral_sweep_mm <= max_sweep_mm])
     return tuple(sorted(kept, key=lambda each: (each.lateral_sweep_mm, -each.tip_offset_mm)))
 

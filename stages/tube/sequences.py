@@ -1,6 +1,7 @@
 """In which order joints move: turn and insert nested tubes from the scope tip to their final place."""
 
-import collections.abc
+from collections.abc import Sequence as SequenceOf
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -68,9 +69,7 @@ class Sequence:
         )
 
 
-def together(
-    tubes: collections.abc.Sequence[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
-) -> Sequence:
+def together(tubes: SequenceOf[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike) -> Sequence:
     """Turn in the scope, insert all tubes with flush tips; each stops at its own insertion.
 
     Tubes are n, the innermost first; the bases are turned by angles `(n,)`, or all by one; `insertions_mm`
@@ -85,9 +84,7 @@ def together(
     return _from_insertions("together", tubes, base_angles_rad, moves)
 
 
-def kuntz2015(
-    tubes: collections.abc.Sequence[Tube], rotation_rad: ArrayLike, outer_mm: float, inner_mm: float
-) -> Sequence:
+def kuntz2015(tubes: SequenceOf[Tube], rotation_rad: ArrayLike, outer_mm: float, inner_mm: float) -> Sequence:
     """Turn, insert both tubes together, insert the inner one alone [Kuntz2015, sec. IV-B].
 
     Tubes are the inner and the outer one; one rotation in the scope turns both.  Raises SettingsError if
@@ -96,14 +93,10 @@ def kuntz2015(
     if len(tubes) != 2:
         raise SettingsError(f"There are {len(tubes)} tubes", expected="two tubes, the inner one first")
     made = together(tubes, rotation_rad, (inner_mm, outer_mm))
-    return Sequence(
-        name="kuntz2015", moves=made.moves, base_angles_rad=made.base_angles_rad, beta_mm=made.beta_mm
-    )
+    return replace(made, name="kuntz2015")
 
 
-def inner_first(
-    tubes: collections.abc.Sequence[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike
-) -> Sequence:
+def inner_first(tubes: SequenceOf[Tube], base_angles_rad: ArrayLike, insertions_mm: ArrayLike) -> Sequence:
     """As `together`, but each tube goes in wholly before the next; the innermost is long enough to."""
     insertions = _insertions(tubes, insertions_mm)
     numbers = np.arange(len(insertions))
@@ -119,7 +112,7 @@ DEFAULT_INCREMENT_MM = 5.0
 
 
 def alternating(
-    tubes: collections.abc.Sequence[Tube],
+    tubes: SequenceOf[Tube],
     base_angles_rad: ArrayLike,
     insertions_mm: ArrayLike,
     *,
@@ -140,7 +133,7 @@ def alternating(
 
 
 def joint_steps(
-    sequence: Sequence, tubes: collections.abc.Sequence[Tube], *, step_mm: float, step_rad: float
+    sequence: Sequence, tubes: SequenceOf[Tube], *, step_mm: float, step_rad: float
 ) -> tuple[Float, Float, np.ndarray]:
     """Cut a sequence into steps, also where a curved part leaves the scope or the next tube.
 
@@ -149,8 +142,7 @@ def joint_steps(
     waypoint.
 
     Raises:
-        SettingsError: If a step is not above 0, the tubes are others, or they get out of order during the
-            motion.
+        SettingsError: If a step is not above 0, the tubes are others, or they get out of order on the way.
     """
     if not (0.0 < step_mm < np.inf and 0.0 < step_rad < np.inf):
         raise SettingsError(f"The steps are {step_mm:g} mm, {step_rad:g} rad", expected="finite, above 0")
@@ -180,7 +172,7 @@ def _in_order(beta: Float, lengths: Float) -> Float:
     return beta
 
 
-def _landmarks(tubes: collections.abc.Sequence[Tube]) -> list[tuple[int, float]]:
+def _landmarks(tubes: SequenceOf[Tube]) -> list[tuple[int, float]]:
     """Return (tube, distance from its base) of tube ends and of the borders of bent pieces."""
     marks = []
     for number, tube in enumerate(tubes):
@@ -201,7 +193,7 @@ def _crossings(landmarks: list[tuple[int, float]], a: Float, b: Float) -> Float:
     return np.asarray(share[(share > 0.0) & (share < 1.0)])
 
 
-def _insert(tubes: collections.abc.Sequence[Tube], moving: np.ndarray) -> str:
+def _insert(tubes: SequenceOf[Tube], moving: np.ndarray) -> str:
     if moving.all():
         return "insert the tube" if len(tubes) == 1 else "insert all tubes"
     if len(tubes) == 2:
@@ -210,7 +202,7 @@ def _insert(tubes: collections.abc.Sequence[Tube], moving: np.ndarray) -> str:
     return f"insert tube {numbers} (from the inside)"
 
 
-def _insertions(tubes: collections.abc.Sequence[Tube], insertions_mm: ArrayLike) -> Float:
+def _insertions(tubes: SequenceOf[Tube], insertions_mm: ArrayLike) -> Float:
     insertions = np.array(insertions_mm, dtype=np.float64, ndmin=1)
     if insertions.shape != (len(tubes),) or not len(tubes) or not np.isfinite(insertions).all():
         raise SettingsError(
@@ -241,10 +233,7 @@ TURN = "turn"
 
 
 def _from_insertions(
-    name: str,
-    tubes: collections.abc.Sequence[Tube],
-    base_angles_rad: ArrayLike,
-    moves: list[tuple[str, Float]],
+    name: str, tubes: SequenceOf[Tube], base_angles_rad: ArrayLike, moves: list[tuple[str, Float]]
 ) -> Sequence:
     """Make the sequence that turns in the scope and then goes through insertions."""
     n = len(tubes)
@@ -260,7 +249,7 @@ def _from_insertions(
     return made
 
 
-def _require_order(sequence: Sequence, tubes: collections.abc.Sequence[Tube]) -> None:
+def _require_order(sequence: Sequence, tubes: SequenceOf[Tube]) -> None:
     """Refuse waypoints at which tips or bases are out of order, or a base would be in front of the scope."""
     if len(tubes) != sequence.n_tubes:
         raise SettingsError(

@@ -74,16 +74,14 @@ class TubeShapes:
             turned; 0 bends towards +x of the scope tip.
         tip_angles_rad ((S, n) float64): Rotation of each tube at its own end.
         arcs ((A, 4) float64): Length in mm; direction of the bend in rad about the tangent, from +x of a
-            frame that is carried along without turning; curvature in 1/mm; radius of the outermost tube in
-            mm.
+            frame that is carried along without turning; curvature in 1/mm; outermost radius in mm.
         first_arc ((S + 1,) int64): Where the arcs of each deployment begin.
         scope_from_tip ((S, 4, 4) float64): Frame carried to the innermost tip without turning; +z forward.
         least_determinant ((S,) float64): Least on the whole way; see `Equilibrium.determinant`.
         lateral_sweep_mm, follow_the_leader_error_mm ((S,) float64): Largest on the whole way; see
             `DeployedSequence`.  Between steps it is bounded by second differences.
         strain ((S,) float64): Largest of bending on the whole way, the scope being straight.
-        arc_error_mm ((S,) float64): Largest distance between the arcs and the tubes; clearances have to be
-            larger by it.
+        arc_error_mm ((S,) float64): Largest distance between arcs and tubes; clearances are larger by it.
         candidates: Deployments looked at.
         refused: Counts by reason.
     """
@@ -160,8 +158,7 @@ def tube_shapes(
 ) -> TubeShapes:
     """Return all deployments of a design that follow a stable branch of equilibria and keep its limits.
 
-    A straight needle's tip stays where that of the innermost tube is; the grid is `ShapeGrid.default` if
-    None.
+    A straight needle's tip stays where that of the innermost tube is; without a grid it is the default.
 
     Raises:
         SettingsError: If there are more than three tubes, they do not nest, or slots make them other than
@@ -191,20 +188,19 @@ def tube_shapes(
     # The kernel runs without the interpreter's lock.
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(with_rotations, rotations))
-    results = np.concatenate([rows for rows, _, _, _ in found])
-    tips = np.concatenate([tips for _, _, _, tips in found])
-    kept, refused = _within(results, limits)
-    counts = np.concatenate([np.diff(first) for _, first, _, _ in found])
-    arcs = np.concatenate([arcs for _, _, arcs, _ in found])[np.repeat(kept, counts)]
-    values = results[kept]
+    results, firsts, arcs, tips = zip(*found, strict=True)
+    values = np.concatenate(results)
+    kept, refused = _within(values, limits)
+    counts = np.concatenate([np.diff(first) for first in firsts])
+    values = values[kept]
     return TubeShapes(
         tubes=mechanics.tubes,
         limits=limits,
         grid=grid,
         insertions_mm=read_only(np.tile(stops[states], (len(rotations), 1))[kept]),
         rotations_rad=read_only(np.repeat(rotations, len(states), axis=0)[kept]),
-        tip_angles_rad=read_only(tips[kept]),
-        arcs=read_only(arcs),
+        tip_angles_rad=read_only(np.concatenate(tips)[kept]),
+        arcs=read_only(np.concatenate(arcs)[np.repeat(kept, counts)]),
         first_arc=read_only(np.concatenate([[0], np.cumsum(counts[kept])])),
         scope_from_tip=read_only(matrices(values[:, kernel.TIP :])),
         least_determinant=read_only(values[:, kernel.LEAST].copy()),
@@ -250,8 +246,7 @@ def _n_stops(longest_mm: float, grid: ShapeGrid) -> int:
 
 
 def _states(mechanics: TubeMechanics, stops: Float) -> tuple[Int, Int]:
-    """Return deployments as indices of stops `(S, n)`, and the one before `(S,)`: the farthest tubes go back
-    together."""
+    """Return deployments as indices of stops `(S, n)`, and the one before: the farthest tubes go back."""
     lengths, n = mechanics.lengths_mm, mechanics.count
     of: dict[tuple[int, ...], int] = {}
     states: list[tuple[int, ...]] = []

@@ -31,16 +31,13 @@ def _breakpoints(lengths, bends, beta, found):
     """Fill `found` (B,) with the arc lengths, rising from 0, where a body or bend ends; return how many."""
     count = 1
     found[0] = 0.0
-    for m in range(lengths.shape[0] + 2 * bends.shape[0]):
-        tube = m
-        along = 0.0
-        if m < lengths.shape[0]:
-            along = lengths[m]
+    bodies = lengths.shape[0]
+    for m in range(bodies + 2 * bends.shape[0]):
+        if m < bodies:
+            s = beta[m] + lengths[m]
         else:
-            bend = (m - lengths.shape[0]) // 2
-            tube = int(bends[bend, 0])
-            along = bends[bend, 1 + (m - lengths.shape[0]) % 2]
-        s = beta[tube] + along
+            bend = bends[(m - bodies) // 2]
+            s = beta[int(bend[0])] + bend[1 + (m - bodies) % 2]
         if s <= SHORTEST_PIECE_MM:
             continue
         at = count
@@ -62,14 +59,12 @@ def cut(design, beta, step, pieces, moments, directions):
     Args:
         pieces ((1 + b + 2 m, PIECE_COLUMNS + b) float64): Is filled, the nearest piece first.
         moments, directions ((1 + b + 2 m, n) float64): Are filled: bending stiffness times precurvature in N
-            mm of each tube in each piece, 0 where it is straight or not there, and the direction of the
-            precurvature in rad.
+            mm of each tube in each piece, 0 where it is straight or not there, and its direction in rad.
     """
     stiffness, lengths, bends = design
     found = np.zeros(1 + lengths.shape[0] + 2 * bends.shape[0])
     n_found = _breakpoints(lengths, bends, beta, found)
-    count = 0
-    last = 0
+    count = last = 0
     for m in range(1, n_found):
         if found[m] - found[last] < SHORTEST_PIECE_MM:
             continue
@@ -84,8 +79,7 @@ def cut(design, beta, step, pieces, moments, directions):
             total += piece[PIECE_COLUMNS + i]
         piece[SOFTNESS] = 1.0 / total
         count += 1
-    steps = _count_steps(stiffness, pieces, moments, count, step)
-    return count, steps
+    return count, _count_steps(stiffness, pieces, moments, count, step)
 
 
 @merged_kernel
@@ -113,23 +107,18 @@ def _fill(design, beta, middle, bending, moments, directions):
 @merged_kernel
 def _count_steps(stiffness, pieces, moments, count, step):
     """Choose the number of steps of each piece by how fast torsion can change there; return their sum."""
-    n = moments.shape[1]
-    total = 0
-    rate = 0.0
-    fastest = 0.0
+    n, total = moments.shape[1], 0
+    rate = fastest = 0.0
     for k in range(count - 1, -1, -1):
         piece = pieces[k]
         length = piece[FAR] - piece[NEAR]
-        stiffest = 0.0
-        turning = 0.0
-        piece[BENT] = 0.0
+        stiffest = turning = piece[BENT] = 0.0
         for i in range(n):
             if moments[k, i] == 0.0:
                 continue
             piece[BENT] += 1.0
             piece[BENT_TUBE] = i
-            coupling = 0.0
-            own = 0.0
+            coupling = own = 0.0
             for j in range(n):
                 if j != i:
                     pull = piece[SOFTNESS] * moments[k, i] * moments[k, j]

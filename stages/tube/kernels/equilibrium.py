@@ -99,8 +99,7 @@ def _least_behind(dpsi, drate, beta, matrix, right):
 
 @merged_kernel
 def _turns_back(dpsi, drate, beta, at, matrix, before, right):
-    """Tell, by the trace of the step's own matrix, whether two ways of turning lose stability within one
-    step."""
+    """Tell, by the trace of the step's own matrix, whether two ways of turning lose stability within it."""
     last = matrix.shape[0]
     trace = 0.0
     if last == 2:
@@ -184,11 +183,9 @@ def newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix,
 def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
     """Find tip angles by raising the precurvature from nothing; return the last error, rad."""
     pieces, moments, directions, count = cutting
-    for i in range(tip_angles.shape[0]):
-        tip_angles[i] = base_angles[i]
+    tip_angles[:] = base_angles
     kept = tip_angles.copy()
-    done, stride = 0.0, 0.125
-    worst = math.inf
+    done, stride, worst = 0.0, 0.125, math.inf
     while done < 1.0 and stride > LEAST_STRIDE:
         share = min(done + stride, 1.0)
         eased = (pieces, math.sqrt(share) * moments, directions, count)
@@ -205,18 +202,16 @@ def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, mat
 
 @merged_kernel
 def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
-    """Start from angles all round until an equilibrium is stable, else take the first; return the last error,
-    rad."""
+    """Start from angles all round until an equilibrium is stable, else take the first; return its error."""
     n = tip_angles.shape[0]
     any_found = math.inf
     kept = base_angles.copy()
     for number in range(ROUND ** (n - 1)):
         code = number
-        for i in range(n):
-            tip_angles[i] = base_angles[i]
-            if i < n - 1:
-                tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
-                code //= ROUND
+        tip_angles[:] = base_angles
+        for i in range(n - 1):
+            tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
+            code //= ROUND
         worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
         if worst < TOLERANCE:
             if least_determinant(nodes, beta) > 0.0:
@@ -285,21 +280,17 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     """
     n = base_angles.shape[1]
     pieces, moments, directions = cutting_scratch(design, n)
-    allocated = 0
-    nodes, steps = scratch_for(allocated, n, n - 1)
-    poses = np.zeros((allocated + 1, 12))
+    nodes, steps = scratch_for(_FIRST_NODE, n, n - 1)
+    poses = np.zeros((1, 12))
     for m in range(beta.shape[0]):
         count, n_steps = cut(design, beta[m], step, pieces, moments, directions)
-        if n_steps != allocated:
-            allocated = n_steps
-            nodes, steps = scratch_for(allocated, n, n - 1)
-            poses = np.zeros((allocated + 1, 12))
-        cutting = (pieces, moments, directions, count)
-        worst, least = settle(
-            design, cutting, base_angles[m], beta[m], nodes, steps, prefer_stable, tip_angles[m]
-        )
+        if n_steps + 1 != poses.shape[0]:
+            nodes, steps = scratch_for(n_steps, n, n - 1)
+            poses = np.zeros((n_steps + 1, 12))
+        cutting, tip = (pieces, moments, directions, count), tip_angles[m]
+        worst, least = settle(design, cutting, base_angles[m], beta[m], nodes, steps, prefer_stable, tip)
         lay(cutting, nodes, steps, poses)
-        turned(poses[allocated], tip_angles[m, 0], results[m, TIP:])
+        turned(poses[n_steps], tip[0], results[m, TIP:])
         results[m, CONVERGED] = 1.0 if worst < TOLERANCE else 0.0
         results[m, STABLE] = 1.0 if least > 0.0 else 0.0
         results[m, LEAST_DETERMINANT] = least

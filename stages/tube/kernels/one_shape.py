@@ -30,6 +30,7 @@ from stages.tube.kernels.shapes import (
     lay_untwisted,
     reach,
     rear_ends,
+    strain_at_rest,
     twists,
 )
 from stages.tube.kernels.sweep import sweep_of
@@ -48,8 +49,7 @@ class DesignArrays(NamedTuple):
         radii, strained ((n,) float64): See `shapes.follow_all`.
         turned ((n,) bool): Whether the shape changes as the tube is turned against the others.
         limits: (N_LIMITS,) float64.
-        planar ((N_TUBES,) float64): The numbers of `planar` where the tubes are, of which the sweep is then
-            exact; else empty.
+        planar ((N_TUBES,) float64): The numbers of `planar` where the tubes are: exact sweep; else empty.
     """
 
     stiffness: Float
@@ -131,21 +131,11 @@ def _fill_untwisted(design, shape):
     n, result = design.radii.shape[0], shape.result
     arrays = design.stiffness, design.lengths, design.bends
     shape.tips[:] = shape.joints[n:] + design.limits[BEND]
-    result[LEAST], result[STRAIN] = 1.0, _strain_at_rest(design)
+    result[LEAST], result[STRAIN] = 1.0, strain_at_rest(design.bends, design.strained)
     shape.number[0] = lay_untwisted(
         arrays, design.radii, design.strained, shape.tips, rear_ends(design.lengths, shape.joints[:n]),
         design.limits[STEP], result, shape.arcs,
     )  # fmt: skip
-
-
-@inner_kernel
-def _strain_at_rest(design):
-    """Return the largest strain of the tubes held straight in the scope."""
-    worst = 0.0
-    for b in range(design.bends.shape[0]):
-        if design.bends[b, 3] > 0.0:
-            worst = max(worst, design.strained[int(design.bends[b, 0])] * design.bends[b, 3])
-    return worst
 
 
 @kernel(nogil=True)
@@ -175,7 +165,8 @@ def whole_way(design, shape):
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
     shape.tips[:] = base
     result[:] = 0.0
-    result[LEAST], result[EXTENSION], result[STRAIN] = 1.0, joints[0], _strain_at_rest(design)
+    result[LEAST], result[EXTENSION] = 1.0, joints[0]
+    result[STRAIN] = strain_at_rest(design.bends, design.strained)
     begin = rear_ends(lengths, still)
     for k in range(1, steps_out + 1):
         end = rear_ends(lengths, np.minimum(stops[k], joints[:n]))
@@ -198,8 +189,7 @@ def whole_way(design, shape):
         shape.number[0], result[ERROR] = lay_out(
             arrays, design.radii, end, cutting, nodes, steps, poses, shape.arcs, 0, places, scratch
         )
-    bent = shape.arcs[: shape.number[0], CURVATURE].max()
-    sagitta = bent * spacing**2 / 8.0
+    sagitta = shape.arcs[: shape.number[0], CURVATURE].max() * spacing**2 / 8.0
     parents = np.arange(steps_out + 1) - 1
     result[SWEEP], result[LEADER] = sweep_of(bodies, states, parents, steps_out, sagitta)
     return result[SWEEP] <= design.limits[MAX_SWEEP]

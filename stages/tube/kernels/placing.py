@@ -18,8 +18,7 @@ from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, ben
 SAME_MM = 1e-9
 # Columns of a stretch: point, tangent and normal where it begins, curvature, length, arc length there.
 POINT, TANGENT, NORMAL, KAPPA, STRETCH_LENGTH, BEGINS, STRETCH_COLUMNS = 0, 3, 6, 9, 10, 11, 12
-# Columns of a placed shape: shape, pierced branch, arc length at the exit (mm), wall angle (rad), run in the
-# wall (mm).
+# Columns of a placed shape: shape, pierced branch, exit (mm along), wall angle (rad), run in the wall (mm).
 PLACED_SHAPE, PLACED_BRANCH, PLACED_EXIT, PLACED_ANGLE, PLACED_RUN, PLACED_COLUMNS = range(6)
 
 
@@ -67,8 +66,7 @@ def cut_at_stops(arcs, stop, stretches, ends, middles, radii):
 @merged_kernel
 def _off(ends, middles, one, other, place):
     """Return how far two shapes are from each other between two stops, at most."""
-    worst = bow = 0.0
-    begin2 = middle2 = end2 = 0.0
+    begin2 = middle2 = end2 = bow = 0.0
     for m in range(3):
         begin = ends[one, place - 1, m] - ends[other, place - 1, m]
         middle = middles[one, place, m] - middles[other, place, m]
@@ -77,8 +75,7 @@ def _off(ends, middles, one, other, place):
         middle2 += middle * middle
         end2 += end * end
         bow += (begin - 2.0 * middle + end) ** 2
-    worst = math.sqrt(max(begin2, middle2, end2))
-    return worst + 0.25 * math.sqrt(bow)
+    return math.sqrt(max(begin2, middle2, end2)) + 0.25 * math.sqrt(bow)
 
 
 @kernel()
@@ -90,8 +87,7 @@ def grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf):
         groups ((S,) int64): Shapes of different groups share nothing.
         ends, middles, radii ((S, K + 1, 3), (S, K + 1, 3), (S, K + 1) float64): See `cut_at_stops`.
         tolerance (float): mm.
-        nodes ((N, 4) int64): Is filled: parent, stop at its end, first shape, the next one with the same
-            parent; N nodes at most.
+        nodes ((N, 4) int64): Is filled, N at most: parent, stop at its end, first shape, next of the parent.
         errors ((N,) float64): Is filled: how far others are from the first shape.
         leaf ((S,) int64): Is filled: the node at which each shape ends.
 
@@ -181,11 +177,8 @@ def _place_turned(environment, tubes, frame, tree, wanted, reasons, traces, plac
                 reasons[wall_exit.NO_EXIT] += 1
                 continue
             row = placed[count]
-            row[PLACED_SHAPE], row[PLACED_BRANCH], row[PLACED_EXIT] = (
-                shapes[e],
-                trace[wall_exit.BRANCH],
-                trace[wall_exit.LEFT_AT],
-            )
+            row[PLACED_SHAPE], row[PLACED_BRANCH] = shapes[e], trace[wall_exit.BRANCH]
+            row[PLACED_EXIT] = trace[wall_exit.LEFT_AT]
             row[PLACED_ANGLE], row[PLACED_RUN] = trace[wall_exit.WALL_ANGLE], trace[wall_exit.WALL_RUN]
             count += 1
         node += 1
@@ -204,9 +197,8 @@ def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed
     """
     total = 0
     for t in range(frames.shape[0]):
-        counts[t] = _place_turned(
-            environment, tubes, frames[t], tree, wanted[t], reasons, traces, placed[total:]
-        )
+        rows = placed[total:]
+        counts[t] = _place_turned(environment, tubes, frames[t], tree, wanted[t], reasons, traces, rows)
         total += counts[t]
 
 
@@ -223,11 +215,9 @@ def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     across = (normal[0], normal[1], normal[2])
     clearance, at = tubes[planar.MARGIN] + beside, 0.0
     for a in range(arcs.shape[0]):
-        length, direction = arcs[a, LENGTH], arcs[a, DIRECTION]
+        length, direction, radius = arcs[a, LENGTH], arcs[a, DIRECTION], arcs[a, RADIUS]
         bend = bend_towards(pose, across, direction, arcs[a, CURVATURE])
-        reason = wall_exit.march(
-            environment, tubes, trace, pose, bend, at, length, arcs[a, RADIUS], clearance
-        )
+        reason = wall_exit.march(environment, tubes, trace, pose, bend, at, length, radius, clearance)
         if reason != wall_exit.ACCEPTED:
             return reason
         pose, across = carried(pose, across, bend, direction, length)

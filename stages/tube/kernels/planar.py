@@ -64,9 +64,8 @@ def sampled_sweep(tubes, outer, inner, every):
     if inner <= curved:
         return 0.0
     # It peaks sharply where the straight part leaves the scope or the outer tube; elsewhere it is smooth.
-    worst = max(
-        off_track(tubes, outer, inner, curved), off_track(tubes, outer, inner, min(outer + curved, inner))
-    )
+    worst = off_track(tubes, outer, inner, curved)
+    worst = max(worst, off_track(tubes, outer, inner, min(outer + curved, inner)))
     for m in range(every, SWEEP_SAMPLES + 1, every):
         worst = max(worst, off_track(tubes, outer, inner, inner * m / SWEEP_SAMPLES))
     return worst
@@ -78,8 +77,7 @@ INSERTION_STEP_MM = 0.05
 
 @inner_kernel
 def sweep_slope(bend):
-    """Return how fast the lateral sweep may change with an insertion, mm a mm; `bend` (rad) is curvature x
-    length.
+    """Return how fast the sweep may change with an insertion, mm a mm; `bend` (rad) is curvature x length.
 
     The sweep is the distance of two points: the tip when it first got there, and the body of the final
     shape.  Where the tip is sampled moves with the insertion by at most as much; the first point moves by at
@@ -113,8 +111,7 @@ def greatest_insertions(tubes, longest, spacing, insertions):
     INSERTION_STEP_MM.
     """
     curved = tubes[CURVED_LENGTH]
-    most = max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE]))
-    slope = sweep_slope(most * curved)
+    slope = sweep_slope(max(abs(tubes[INNER_CURVATURE]), abs(tubes[OVERLAP_CURVATURE])) * curved)
     for m in range(len(insertions)):
         greatest = min(curved, longest)
         tried = int(math.ceil(INSERTION_STEP_MM / spacing))

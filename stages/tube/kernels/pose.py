@@ -105,6 +105,8 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
     lengths, piece_of = steps
     k = piece_of[at]
     h = (end - begin) * lengths[at]
+    twist[:] = 0.0
+    twist[5] = h
     if pieces[k, BENT] == 1.0:
         i = int(pieces[k, BENT_TUBE])
         kappa = pieces[k, SOFTNESS] * moments[k, i]
@@ -112,15 +114,10 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
         twist[0] = h * kappa * math.cos(angle)
         twist[1] = h * kappa * math.sin(angle)
         twist[2] = h * rate[at, i]
-        twist[3] = twist[4] = 0.0
-        twist[5] = h
         _exponential(twist, out, 1)
         turned(out[1], -twist[2], out[0])
         return
-    if pieces[k, BENT] == 0.0:
-        twist[0] = twist[1] = twist[2] = twist[3] = twist[4] = 0.0
-        twist[5] = h
-    else:
+    if pieces[k, BENT] != 0.0:
         ux1, uy1 = curvature(cutting, k, begin + GAUSS * (end - begin), lengths[at], psi, rate, at)
         ux2, uy2 = curvature(cutting, k, end - GAUSS * (end - begin), lengths[at], psi, rate, at)
         c = COMMUTATOR * h * h
@@ -129,15 +126,13 @@ def step_of(cutting, nodes, steps, at, begin, end, twist, out):
         twist[2] = c * (ux1 * uy2 - uy1 * ux2)
         twist[3] = c * (uy1 - uy2)
         twist[4] = c * (ux2 - ux1)
-        twist[5] = h
     _exponential(twist, out, 0)
 
 
 @kernel()
 def lay(cutting, nodes, steps, poses):
     """Fill `poses` (N + 1, 12) with the Bishop frame of every node; the first is the identity."""
-    twist = np.zeros(6)
-    motion = np.zeros((2, 12))
+    twist, motion = np.zeros(6), np.zeros((2, 12))
     for m in range(12):
         poses[0, m] = 1.0 if m in (0, 4, 8) else 0.0
     for at in range(steps[0].shape[0]):
@@ -150,8 +145,7 @@ def frames_at(cutting, nodes, steps, poses, arc_lengths, found, angles, rates):
     """Fill poses (M, 12), psi and u (M, n) at arc lengths (M,) between front plate and tip."""
     s, psi, rate, _dpsi, _drate = nodes
     lengths = steps[0]
-    twist = np.zeros(6)
-    motion = np.zeros((2, 12))
+    twist, motion = np.zeros(6), np.zeros((2, 12))
     for m in range(arc_lengths.shape[0]):
         at = min(max(np.searchsorted(s, arc_lengths[m], "right") - 1, 0), lengths.shape[0] - 1)
         h = lengths[at]

@@ -39,12 +39,11 @@ LEAST, STRAIN, SWEEP, LEADER, ERROR, EXTENSION, TIP, SHAPE_COLUMNS = 0, 1, 2, 3,
 @inner_kernel
 def _settled(design, base_angles, beta, step, tip_angles):
     """Solve from a guess; return the error of the base angles, the cutting, nodes and steps."""
-    n = base_angles.shape[0]
-    last = n - 1
-    pieces, moments, directions = cutting_scratch(design, n)
+    last = base_angles.shape[0] - 1
+    pieces, moments, directions = cutting_scratch(design, last + 1)
     count, n_steps = cut(design, beta, step, pieces, moments, directions)
     cutting = (pieces, moments, directions, count)
-    nodes, steps = scratch_for(n_steps, n, last)
+    nodes, steps = scratch_for(n_steps, last + 1, last)
     matrix, right = np.zeros((last, last)), np.zeros(last)
     worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
     return worst, cutting, nodes, steps
@@ -228,6 +227,16 @@ def twists(bends):
 
 
 @inner_kernel
+def strain_at_rest(bends, strained):
+    """Return the largest strain of the tubes held straight in the scope."""
+    worst = 0.0
+    for b in range(bends.shape[0]):
+        if bends[b, 3] > 0.0:
+            worst = max(worst, strained[int(bends[b, 0])] * bends[b, 3])
+    return worst
+
+
+@inner_kernel
 def lay_untwisted(design, radii, strained, base, beta, step, result, arcs):
     """Write the arcs of tubes that do not twist each other, which are exact; return how many there are.
 
@@ -287,24 +296,20 @@ def carried(pose, across, bend, direction, length):
 
 
 @kernel(nogil=True)
-def follow_all(
-    design, radii, strained, base_angles, stops, states, parents, step, tips, results, first, arcs
-):
+def follow_all(design, radii, strained, base, stops, states, parents, step, tips, results, first, arcs):
     """Follow all deployments with given rotations of the rear ends.
 
     Args:
         design (tuple): See `assembly`.
-        radii, strained ((n,) float64): Outer radius of each tube, and its strain for each 1/mm of change of
-            curvature, mm.
-        base_angles ((n,) float64): Rotation of the rear ends, rad.
+        radii, strained ((n,) float64): Outer radius of each tube, and its strain per change of curvature, mm.
+        base ((n,) float64): Rotation of the rear ends, rad.
         stops ((K,) float64): Insertions, rising from 0, mm.
         states ((S, n) int64): Deployments as indices of stops, not rising from the innermost tube on; the
             first is all 0.
         parents ((S,) int64): Of each the deployment one stop before, -1 for the first; it is listed before.
         step (float): See `assembly.cut`.
         tips ((S, n) float64): Is filled with the angles at the tubes' own ends, rad.
-        results ((S, SHAPE_COLUMNS) float64): Is filled; a least determinant of 0 or less says that the tubes
-            snap on the way.
+        results ((S, SHAPE_COLUMNS) float64): Is filled; with a least determinant of 0 or less the tubes snap.
         first ((S + 1,) int64): Is filled: where the arcs of each deployment begin in `arcs`.
         arcs ((rows, ARC_COLUMNS) float64): Is filled.
 
@@ -318,12 +323,10 @@ def follow_all(
     found, angles, rates = np.zeros((n_stops, 12)), np.zeros((n_stops, n)), np.zeros((n_stops, n))
     places = np.zeros((2 * MOST_ARCS * (1 + design[1].shape[0] + 2 * design[2].shape[0]), 4))
     scratch = np.zeros((places.shape[0], 12)), np.zeros((places.shape[0], n)), np.zeros((places.shape[0], n))
-    tips[0] = base_angles
+    tips[0] = base
     results[0] = 0.0
     results[0, LEAST] = 1.0
-    for b in range(design[2].shape[0]):
-        if design[2][b, 3] > 0.0:
-            results[0, STRAIN] = max(results[0, STRAIN], strained[int(design[2][b, 0])] * design[2][b, 3])
+    results[0, STRAIN] = strain_at_rest(design[2], strained)
     for m in (0, 4, 8):
         results[0, TIP + m] = 1.0
     sagitta = 0.0
@@ -338,7 +341,7 @@ def follow_all(
         begin = rear_ends(design[1], stops[states[parent]])
         end = rear_ends(design[1], stops[states[state]])
         tips[state] = tips[parent]
-        least, cutting, nodes, steps = reach(design, base_angles, still, begin, end, step, tips[state])
+        least, cutting, nodes, steps = reach(design, base, still, begin, end, step, tips[state])
         results[state, LEAST] = min(results[parent, LEAST], least)
         if least <= 0.0:
             continue
@@ -357,9 +360,7 @@ def follow_all(
             return -1
         first[state + 1] += number
         results[state, ERROR] = error
-        bent = 0.0
-        for m in range(first[state], first[state + 1]):
-            bent = max(bent, arcs[m, CURVATURE])
+        bent = arcs[first[state] : first[state + 1], CURVATURE].max()
         sagitta = max(sagitta, bent * (stops[1] - stops[0]) ** 2 / 8.0)
         results[state, SWEEP], results[state, LEADER] = sweep_of(bodies, states, parents, state, sagitta)
     return first[n_states]

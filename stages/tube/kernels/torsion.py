@@ -141,15 +141,12 @@ def twist(design, cutting, tip_angles, nodes, steps):
     pieces, moments, directions, count = cutting
     s, psi, rate, dpsi, drate = nodes
     lengths, piece_of = steps
-    n = tip_angles.shape[0]
-    columns = dpsi.shape[1]
-    at = lengths.shape[0]
+    n, columns, at = tip_angles.shape[0], dpsi.shape[1], lengths.shape[0]
     work = np.zeros((SCRATCH_ROWS, columns + 1, n))
     pairs = np.zeros((n * (n - 1) // 2, PAIR_COLUMNS))
     s[at] = pieces[count - 1, FAR] if count > 0 else 0.0
     for i in range(n):
-        psi[at, i] = tip_angles[i]
-        rate[at, i] = 0.0
+        psi[at, i], rate[at, i] = tip_angles[i], 0.0
         for c in range(columns):
             dpsi[at, c, i] = 1.0 if c == i else 0.0
             drate[at, c, i] = 0.0
@@ -160,8 +157,7 @@ def twist(design, cutting, tip_angles, nodes, steps):
         for m in range(number):
             at -= 1
             s[at] = pieces[k, NEAR] + (number - 1 - m) * h
-            lengths[at] = h
-            piece_of[at] = k
+            lengths[at], piece_of[at] = h, k
             if bent > 0:
                 _step(nodes, at + 1, h, pairs, bent, work)
             else:

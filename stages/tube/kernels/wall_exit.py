@@ -80,14 +80,11 @@ def _reason(label):
 
 @merged_kernel
 def _wall_normal(labels, geometry, x, y, z):
-    """Return the lumen's outward unit normal at a border point, away from its centroid nearby, in corner
-    axes, mm."""
+    """Return the lumen's outward unit normal at a border point, off its centroid nearby, in corner axes."""
     u = geometry[0, 0] * x + geometry[0, 1] * y + geometry[0, 2] * z + geometry[0, 3]
     v = geometry[1, 0] * x + geometry[1, 1] * y + geometry[1, 2] * z + geometry[1, 3]
     w = geometry[2, 0] * x + geometry[2, 1] * y + geometry[2, 2] * z + geometry[2, 3]
-    su = math.sqrt(geometry[0, 4])
-    sv = math.sqrt(geometry[1, 4])
-    sw = math.sqrt(geometry[2, 4])
+    su, sv, sw = math.sqrt(geometry[0, 4]), math.sqrt(geometry[1, 4]), math.sqrt(geometry[2, 4])
     r = NORMAL_RADIUS_MM
     mu = mv = mw = 0.0
     for k in range(max(int(w - r / sw), 0), min(int(w + r / sw) + 1, labels.shape[2])):
@@ -109,13 +106,12 @@ def _wall_normal(labels, geometry, x, y, z):
 @kernel()
 def wall_angle(labels, geometry, pose):
     """Return the angle in rad between a tangent and the lumen's border at its point; pi/2 is square on."""
-    nu, nv, nw = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
+    normal = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
     tx, ty, tz = pose[3], pose[4], pose[5]
     sine = 0.0
     for axis in range(3):
         along = geometry[axis, 0] * tx + geometry[axis, 1] * ty + geometry[axis, 2] * tz
-        normal = nu if axis == 0 else (nv if axis == 1 else nw)
-        sine += along * math.sqrt(geometry[axis, 4]) * normal
+        sine += along * math.sqrt(geometry[axis, 4]) * normal[axis]
     return math.asin(min(max(sine, -1.0), 1.0))
 
 
@@ -132,9 +128,7 @@ def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
             inside = middle
         else:
             outside = middle
-    trace[PHASE] = LEAVING
-    trace[LEFT_AT] = s0 + inside
-    trace[WALL_RUN] = 0.0
+    trace[PHASE], trace[LEFT_AT], trace[WALL_RUN] = LEAVING, s0 + inside, 0.0
     if branch < 0 or branch >= mediastinal.shape[0] or mediastinal[branch]:
         trace[REFUSAL] = LEAVES_MEDIASTINAL
         return
@@ -167,8 +161,7 @@ def _tissue_gap(environment, trace, x, y, z, required):
     if gap >= MIN_GAP_MM:
         return gap, FREE
     reach = required + EXACT_REACH_MM
-    branch = int(trace[BRANCH])
-    distance, label = exact_distance(labels, geometry, x, y, z, bits, branch, reach)
+    distance, label = exact_distance(labels, geometry, x, y, z, bits, int(trace[BRANCH]), reach)
     gap = distance - required
     if trace[PHASE] == IN_TISSUE:
         lumen, _label = exact_distance(labels, geometry, x, y, z, _LUMEN, _NOBODY, reach)
@@ -217,8 +210,7 @@ def refused_exits(tubes, s, lack, first_outer):
 
 @merged_kernel
 def _run_in_wall(environment, pose, bend, begin, end, radius):
-    """Return how much of a stretch, at least, is nearer to an airway than `radius`; other branches are
-    farther."""
+    """Return how much of a stretch is nearer to an airway than `radius`, at least; others are farther."""
     labels, geometry = environment.labels, environment.geometry
     run = 0.0
     s = begin
@@ -270,8 +262,7 @@ def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
     branches.  Returns a reason, ACCEPTED if there is none.
     """
     labels, geometry = environment.labels, environment.geometry
-    s = 0.0
-    last = 0.0
+    s = last = 0.0
     while True:
         if trace[PHASE] == IN_LUMEN:
             x, y, z = point_on_arc(pose, bend, s)
@@ -293,22 +284,20 @@ def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
                 trace[PHASE] = IN_LUMEN
                 last = s
                 continue
-            if left > length:
-                reason = _march_beyond(
-                    environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance
-                )
-                if trace[REFUSAL] == ACCEPTED:
-                    trace[REFUSAL] = reason
-                return ACCEPTED
-            if trace[REFUSAL] != ACCEPTED:
-                return int(trace[REFUSAL])
-            trace[PHASE] = IN_WALL
-        return _march_beyond(environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance)
+            if left <= length:
+                if trace[REFUSAL] != ACCEPTED:
+                    return int(trace[REFUSAL])
+                trace[PHASE] = IN_WALL
+        reason = _march_beyond(environment, tubes, trace, pose, bend, s0, begin, length, radius, clearance)
+        if trace[PHASE] != LEAVING:
+            return reason
+        if trace[REFUSAL] == ACCEPTED:
+            trace[REFUSAL] = reason
+        return ACCEPTED
 
 
 @kernel()
 def reset(trace):
     """Put a trace at the scope tip, in the lumen."""
-    for m in range(trace.shape[0]):
-        trace[m] = 0.0
+    trace[:] = 0.0
     trace[BRANCH] = -1.0

@@ -1,6 +1,6 @@
 // What the page asks over the socket to the server, and the answers, part by part; lungaccess.showing.explorer.messages says how.
-import { byId } from "../report/anatomy_page.js";
 import { TYPES } from "../report/decode.js";
+import { byId } from "../report/structures.js";
 import { say } from "./widgets.js";
 
 const LAST = ["end", "error", "superseded"];

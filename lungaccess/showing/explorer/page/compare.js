@@ -1,7 +1,6 @@
 // Up to five plans beside each other: a table, and all of them in 3-D and in the slices.
-import { byId } from "../report/anatomy_page.js";
 import { planStyle } from "../report/colours.js";
-import { made, swatch } from "../report/structures.js";
+import { byId, made, swatch } from "../report/structures.js";
 import { MOST_COMPARED, planKey, planQuestion } from "./state.js";
 import { button, fillRows, mm, say } from "./widgets.js";
 

@@ -1,5 +1,5 @@
 // The page of the explorer: what is asked, what is shown, and how both follow from the address.
-import { byId, openPage } from "../report/anatomy_page.js";
+import { openPage } from "../report/anatomy_page.js";
 import { Bronchoscopy } from "../report/bronchoscopy.js";
 import { planStyle } from "../report/colours.js";
 import { DevicePage } from "../report/device_page.js";
@@ -7,7 +7,7 @@ import { deviceLines, otherLines, showBall, showDevices, showOther } from "../re
 import { Motion } from "../report/motion.js";
 import { STANDARD } from "../report/slices.js";
 import { Player } from "../report/player.js";
-import { oncePerFrame } from "../report/structures.js";
+import { byId, oncePerFrame } from "../report/structures.js";
 import { minus, norm, rgb } from "../report/vectors.js";
 import { VoxelImage } from "../report/voxel_image.js";
 import { placedVolume } from "../report/voxels.js";
@@ -32,7 +32,7 @@ class ExplorerPage extends DevicePage {
     this.plans = new Map();
     this.search = new Search(this);
     this.exits = this.tips = this.reach = this.motion = null;
-    this.targetLps = this.failure = null;
+    this.target = this.failure = null;
     this.sharp = 0;
     this.stale = { scene: true, slices: true };
     const later = oncePerFrame((atOnce) => (this.stale.scene ? this.show(atOnce ? "rest" : "moving") : this.draw()));
@@ -121,7 +121,7 @@ class ExplorerPage extends DevicePage {
     this.structures = structures;
     const isOpen = await this.openScene();
     this.panes = new Panes(this.redraw);
-    this.linkSlices({ placed: () => this.describe(), picked: (place) => this.chooseTarget(lpsText(place)) });
+    this.linkSlices({ placed: () => this.describe(), picked: (place) => this.choose({ target: lpsText(place) }) });
     connectPainting(this);
     this.views.lookAt(this.start);
     this.setTheme(document.documentElement.dataset.theme);
@@ -135,15 +135,15 @@ class ExplorerPage extends DevicePage {
   connectControls() {
     const clicks = {
       undo: () => history.back(), redo: () => history.forward(), outline: () => this.outline(),
-      "cross-target": () => this.chooseTarget(lpsText(this.place)), free: () => this.state.set(FREE),
+      "cross-target": () => this.choose({ target: lpsText(this.place) }), free: () => this.state.set(FREE),
       "tip-back": () => this.moveTip(-1), "tip-forward": () => this.moveTip(1), "help-open": () => byId("help").showModal(),
     };
     for (const [id, act] of Object.entries(clicks)) byId(id).addEventListener("click", act);
     byId("target-form").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.chooseTarget(byId("target-text").value.trim());
+      this.choose({ target: byId("target-text").value.trim() });
     });
-    byId("nodule").addEventListener("change", (event) => event.target.value && this.chooseTarget(event.target.value));
+    byId("nodule").addEventListener("change", (event) => event.target.value && this.choose({ target: event.target.value }));
     byId("reach-slices").addEventListener("change", () => this.redrawSlices());
     byId("reach-scene").addEventListener("change", () => this.showReach());
     byId("exits-by").addEventListener("change", () => this.showExits());
@@ -153,10 +153,6 @@ class ExplorerPage extends DevicePage {
 
   get end() {
     return this.motion && this.motion.end;
-  }
-
-  get target() {
-    return this.targetLps;
   }
 
   // Where the cross is.
@@ -173,7 +169,7 @@ class ExplorerPage extends DevicePage {
 
   describe() {
     this.asker.ask("place", { point: this.place }, (found) => {
-      const isTarget = this.targetLps && norm(minus(this.place, this.targetLps)) < 0.1;
+      const isTarget = this.target && norm(minus(this.place, this.target)) < 0.1;
       const known = isTarget && this.facts.targets.find(({ text }) => text === this.state.asked.target);
       const near = Object.entries(found.distance_mm).filter(([, value]) => value < 30).map(([name, value]) => `${mm(value)} to ${name}`);
       byId("place-words").textContent = [
@@ -204,24 +200,17 @@ class ExplorerPage extends DevicePage {
     }, (words) => (byId("target-error").textContent = words));
   }
 
-  chooseTarget(text) {
-    this.state.set({ ...FREE, target: text });
-  }
-
-  chooseExit(entry) {
-    this.state.set({ ...FREE, exit: entry });
-  }
-
-  chooseTip(tip) {
-    this.state.set({ ...FREE, tip });
+  // Choose a target, an exit (an entry of the atlas) or a tip of the scope: { target }, { exit } or { tip }.
+  choose(what) {
+    this.state.set({ ...FREE, ...what });
   }
 
   // Choose the next place of the scope along the airway.
   moveTip(way) {
     const { tips, motion, state: { asked } } = this;
     const from = tips?.place(asked.tip) ? asked.tip : tips?.nearest(motion?.plan.scope_tip_lps ?? this.place);
-    const next = tips?.next(from, way, this.targetLps) ?? null;
-    if (next !== null) this.chooseTip(next);
+    const next = tips?.next(from, way, this.target) ?? null;
+    if (next !== null) this.choose({ tip: next });
   }
 
   // Show what the address says: everything begins here.
@@ -238,7 +227,7 @@ class ExplorerPage extends DevicePage {
   }
 
   clear() {
-    this.exits = this.motion = this.targetLps = this.plan = this.failure = null;
+    this.exits = this.motion = this.target = this.plan = this.failure = null;
     this.planPanel.clear("Choose a target: click into a slice, or pick a nodule.");
     this.showExits();
     this.showPlan();
@@ -272,8 +261,8 @@ class ExplorerPage extends DevicePage {
   }
 
   takeTarget(lps) {
-    if (this.targetLps && norm(minus(this.targetLps, lps)) < 1e-6) return;
-    this.targetLps = [...lps];
+    if (this.target && norm(minus(this.target, lps)) < 1e-6) return;
+    this.target = [...lps];
     this.moveTo(lps);
     if (this.scene) showBall(this.scene, "target", lps);
     this.fitImage(lps);
@@ -333,7 +322,7 @@ class ExplorerPage extends DevicePage {
   showPlan() {
     byId("player").hidden = !this.motion;
     this.drawn = null;
-    if (this.scene && !this.targetLps) showBall(this.scene, "target", null);
+    if (this.scene && !this.target) showBall(this.scene, "target", null);
     if (this.orbit) this.fitToPlan();
     this.redraw();
   }
@@ -341,7 +330,7 @@ class ExplorerPage extends DevicePage {
   showExits(words = null) {
     const { exits, state: { asked } } = this, chosen = exits?.numberOf(asked.exit);
     byId("exits-words").textContent = words ?? exits?.answer.words ?? "";
-    fillRows(byId("exits"), exits?.rows(chosen, (entry) => this.chooseExit(entry)) ?? []);
+    fillRows(byId("exits"), exits?.rows(chosen, (entry) => this.choose({ exit: entry })) ?? []);
     byId("exits-more").textContent = exits?.unlisted ?? "";
     this.scene?.setPoints("exits", exits?.count ? exits.points(byId("exits-by").value, chosen) : null);
     const tip = this.tips?.place(asked.tip);
@@ -404,7 +393,7 @@ class ExplorerPage extends DevicePage {
     const of = this.motion ? deviceLines(this.motion.plan, this.motion.at(this.player.position)) : [];
     const others = this.compared.shown.flatMap(({ motion, number }) => otherLines(motion.plan, motion.end, number));
     const planes = Object.fromEntries(Object.entries(STANDARD).filter(([name]) => this.panes.isShown(name)));
-    this.views.draw(planes, { lines: [...others, ...of, ...(this.stroke ? [this.stroke] : [])], target: this.targetLps }, isCoarse);
+    this.views.draw(planes, { lines: [...others, ...of, ...(this.stroke ? [this.stroke] : [])], target: this.target }, isCoarse);
   }
 
   // Take the patient again, of which the masks were corrected: what was known of it holds no longer.
@@ -420,7 +409,7 @@ class ExplorerPage extends DevicePage {
   report() {
     const { plan, exits, reach, scene } = this, isPlan = plan?.key === planKey(this.state.asked);
     return {
-      ...super.report(), asked: { ...this.state.asked }, place_lps: this.place, target_lps: this.targetLps, failure: this.failure,
+      ...super.report(), asked: { ...this.state.asked }, place_lps: this.place, target_lps: this.target, failure: this.failure,
       exits: exits && { count: exits.count, complete: exits.answer.complete, entries: [...exits.entries] },
       plan: isPlan ? { ...plan, motion: null, appraised: Boolean(plan.appraisal) } : null,
       tip_lps: this.motion ? this.motion.at(this.player.position).tip : null,

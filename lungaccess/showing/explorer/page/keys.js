@@ -1,5 +1,5 @@
 // Keys, which the help lists.
-import { byId } from "../report/anatomy_page.js";
+import { byId } from "../report/structures.js";
 
 // Return what follows an item in a list, or comes before it, round the ends.
 function beside(items, now, step) {
@@ -11,11 +11,11 @@ export function connectKeys(page) {
   const press = (id) => () => byId(id).click();
   const target = () => {
     const { facts: { targets }, state: { asked } } = page;
-    if (targets.length) page.chooseTarget(beside(targets, targets.findIndex(({ text }) => text === asked.target), 1).text);
+    if (targets.length) page.choose({ target: beside(targets, targets.findIndex(({ text }) => text === asked.target), 1).text });
   };
   const exit = (step) => () => {
     const { exits, state: { asked } } = page;
-    if (exits?.count) page.chooseExit(beside(exits.entries, exits.numberOf(asked.exit), step));
+    if (exits?.count) page.choose({ exit: beside(exits.entries, exits.numberOf(asked.exit), step) });
   };
   const actions = {
     n: target, e: exit(1), E: exit(-1), "[": press("tip-back"), "]": press("tip-forward"), x: press("free"), k: press("keep"),

@@ -1,6 +1,5 @@
 // The page on which a CT or a patient of this machine is chosen, segmented, and then explored.
-import { byId } from "../report/anatomy_page.js";
-import { made } from "../report/structures.js";
+import { byId, made } from "../report/structures.js";
 import { Asker } from "./asker.js";
 import { button, fillList, say } from "./widgets.js";
 

@@ -1,5 +1,5 @@
 // Masks mended by hand: strokes drawn in the slices, of which the server makes voxels, a new lung and a new plan.
-import { byId } from "../report/anatomy_page.js";
+import { byId } from "../report/structures.js";
 import { add, cross } from "../report/vectors.js";
 import { whatIf } from "./state.js";
 

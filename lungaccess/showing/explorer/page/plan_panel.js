@@ -1,6 +1,5 @@
 // What is said of the plan: headline, numbers, advice, why there is none, files, and the command.
-import { byId } from "../report/anatomy_page.js";
-import { made } from "../report/structures.js";
+import { byId, made } from "../report/structures.js";
 import { planKey, whatIf } from "./state.js";
 import { fillList, fillRows, say } from "./widgets.js";
 

@@ -60,8 +60,7 @@ export function connectPointer(page) {
     page.preview(null);
     if (event.type === "pointercancel") return;
     if (value === null) page.pickAt(place(event));
-    else if (kind === "exit") page.chooseExit(value);
-    else page.chooseTip(value);
+    else page.choose({ [kind]: value });
   };
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, letGo);
 
@@ -81,16 +80,16 @@ export function connectPointer(page) {
   page.pickAt = (at) => {
     if (!scene.view) return undefined;
     const { exits } = page, exit = exits && nearestExit(at);
-    if (exit !== null && near(exits.places[exit], at) <= HANDLE_PX / 2) return page.chooseExit(exits.entries[exit]);
+    if (exit !== null && near(exits.places[exit], at) <= HANDLE_PX / 2) return page.choose({ exit: exits.entries[exit] });
     const found = scene.pick(...at, { pickable: ["nodule"] })?.hits.find(({ key }) => key === "nodule");
     const nodules = page.facts.targets.filter(({ text }) => found && text.startsWith("nodule "));
     const nodule = leastOf(nodules, ({ lps_mm: place }) => norm(minus(place, found.point)));
-    if (nodule) return page.chooseTarget(nodule.text);
+    if (nodule) return page.choose({ target: nodule.text });
     const { eye, forward } = orbit.camera();
     const [x, y] = [(2 * at[0]) / canvas.clientWidth - 1, 1 - (2 * at[1]) / canvas.clientHeight];
     const ray = rayThrough(scene, x, y);
     const depth = dot(minus(page.place, eye), forward) / dot(ray, forward);
     page.moveTo(add(eye, times(ray, depth)));
-    return page.chooseTarget(lpsText(page.place));
+    return page.choose({ target: lpsText(page.place) });
   };
 }

@@ -36,7 +36,7 @@ export class Search {
     if (last.answer !== "end") return last;
     asker.ask("ready", { what_if });
     let layer = null;
-    asker.ask("reach", { what_if, around: page.targetLps || page.place }, (part) => {
+    asker.ask("reach", { what_if, around: page.target || page.place }, (part) => {
       if (part.answer === "reach grid") layer = new ReachLayer(part, page.reach);
       else page.takeReach(layer.take(part));
     }, (words) => page.takeReach(null, words));

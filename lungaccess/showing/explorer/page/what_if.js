@@ -1,6 +1,6 @@
 // What is changed of the system and the search: a field for each value of the address; what is changed is marked, what cannot
 // be is answered beside it.
-import { byId } from "../report/anatomy_page.js";
+import { byId } from "../report/structures.js";
 import { FREE, NUMBERS, OWN, textOf, valueFrom } from "./state.js";
 
 const SLIDER_WAIT_MS = 60;

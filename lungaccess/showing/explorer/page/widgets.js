@@ -1,6 +1,5 @@
 // Small parts of the page: buttons, tables, and words.
-import { byId } from "../report/anatomy_page.js";
-import { made } from "../report/structures.js";
+import { byId, made } from "../report/structures.js";
 
 // Show words about what is going on.
 export const say = (words) => (byId("status").textContent = words);

@@ -5,7 +5,7 @@ import { Scene, VIEW_HALF_ANGLE } from "./scene.js";
 import { SlicePanel } from "./slice_panel.js";
 import { SliceViews } from "./slice_views.js";
 import { Slice, STANDARD } from "./slices.js";
-import { addSwitch, oncePerFrame } from "./structures.js";
+import { addSwitch, byId, oncePerFrame, shiftBy } from "./structures.js";
 import { rgb } from "./vectors.js";
 import { ViewTools } from "./view_tools.js";
 
@@ -13,9 +13,9 @@ import { ViewTools } from "./view_tools.js";
 // one.  A moment is at least so many ms, and a few times as long as the last picture took.
 const REST_MS = 300, FINE_MS = 900, PICTURES = 4;
 
-export const byId = (id) => document.getElementById(id);
-
-// A page with its data; `shownFirst` lists the structures that are shown at first, if not those that say so.
+// A page with its data; `shownFirst` lists the structures that are shown at first, if not those that say so.  It has
+//   cutThrough(): through which point a cut goes, along which axis, and what it is called, null for no cut;
+//   distancesOf(point): words on how far a point is from what matters.
 export class AnatomyPage {
   constructor(data, shownFirst = null) {
     this.data = data;
@@ -108,11 +108,6 @@ export class AnatomyPage {
     return true;
   }
 
-  // Return through which point a cut goes, along which axis, and what it is called; null for no cut.
-  cutThrough() {
-    return null;
-  }
-
   // Return labels in the view: { text, point: LPS mm, colour }.
   labels() {
     return [];
@@ -121,11 +116,6 @@ export class AnatomyPage {
   // Name what was hit in the 3-D view.
   nameOf({ kind, key }) {
     return kind === "surface" ? this.scene.surfaces.get(key).name : key;
-  }
-
-  // Say how far a point is from what matters.
-  distancesOf() {
-    return [];
   }
 
   // Return how far apart two points are along the devices, in mm; null without devices.
@@ -183,7 +173,7 @@ export class AnatomyPage {
     if (!this.scene || !this.views) return;
     const at = this.scene.project(this.views.place), cross = document.querySelector(".scene-cross");
     cross.hidden = !at;
-    if (at) cross.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px)`;
+    if (at) cross.style.transform = shiftBy(at);
   }
 
   moveTo(place) {

@@ -41,8 +41,7 @@ export class Breath {
   pulledBack(point, share) {
     let place = point;
     for (let n = 0; n < MOST_STEPS; n++) {
-      const next = minus(point, times(this.displacement(place), share));
-      const step = minus(next, place);
+      const next = minus(point, times(this.displacement(place), share)), step = minus(next, place);
       place = next;
       if (dot(step, step) < CONVERGED_MM ** 2) break;
     }
@@ -95,16 +94,10 @@ export class Breath {
     return { n, phase: phases[n] };
   }
 
-  // Return whether a phase is proved; null where the plan states no window.
-  holds(number, phase) {
-    const { window } = this.plans[number];
-    return window && window.some(([begin, end]) => begin <= phase && phase <= end);
-  }
-
   // Say which phase it is, and what the plan states of it.
   words(number, phase, accepted) {
-    const { samples, warning_only: warning } = this.plans[number];
-    const inside = this.holds(number, phase), { n, phase: known } = this.sample(number, phase);
+    const { samples, window, warning_only: warning } = this.plans[number], { n, phase: known } = this.sample(number, phase);
+    const inside = window && window.some(([begin, end]) => begin <= phase && phase <= end);
     const good = !accepted ? "✗ stated, but the check refuses the plan" : warning ? "? by a model only" : "✓ proved";
     const verdict = inside === null ? "not computed" : inside ? good : "✗ not proved";
     return `${(100 * phase).toFixed(0)} % of the breath: ${verdict}; at ${(100 * known).toFixed(0)} % ends ${samples.target_mm[n].toFixed(1)} mm from the target`;

@@ -11,8 +11,8 @@ const RINGS_MM = [0.8, 0.2], RING_SHADE = 0.25, ROUND_SIDES = 48;
 const TAKEN = "#7DF0B5", OTHER_WAY = "#F2F2F2";
 
 export class Bronchoscopy {
-  // prompt: an element for the words of the bifurcation ahead, if there is one.
-  constructor(scene, canvas, caption, prompt = null) {
+  // caption, prompt: elements for the words on the scope's tip, and on the bifurcation ahead.
+  constructor(scene, canvas, caption, prompt) {
     Object.assign(this, { scene, canvas, caption, prompt });
   }
 
@@ -32,11 +32,7 @@ export class Bronchoscopy {
     this.caption.textContent = `Scope's tip ${where}`;
     const ahead = state.stage === 0 ? bifurcationsAhead(motion, state) : [];
     this.named = ahead.flatMap(({ openings }) => openings).filter((opening) => this.name(opening, pose));
-    if (this.prompt) this.say(ahead, state);
-  }
-
-  say(ahead, { moved }) {
-    const words = ahead.map((each) => (each.moved_mm > moved ? `Ahead: ${each.text}` : each.text)).join(" ");
+    const words = ahead.map((each) => (each.moved_mm > state.moved ? `Ahead: ${each.text}` : each.text)).join(" ");
     if (this.prompt.textContent !== words) this.prompt.textContent = words;
   }
 

@@ -1,5 +1,6 @@
 // A page with the devices of a plan in its 3-D view: what of them is fitted, cut, named and measured.
 import { AnatomyPage } from "./anatomy_page.js";
+import { lineOf } from "./devices.js";
 import { ballAround, sideOf } from "./orbit.js";
 import { alongLine } from "./surfaces.js";
 import { minus, mix, norm, unit } from "./vectors.js";
@@ -12,21 +13,13 @@ const NAMES = {
 const SCOPE_POINTS = 16, AROUND_PLAN_MM = 12;
 const NEAR_TARGET_MM = 25;
 
+// It has
+//   end: what is where at the end of the deployment that is followed, null without one; see motion.js;
+//   target: LPS mm, null without one.
 export class DevicePage extends AnatomyPage {
-  // Return what is where at the end of the deployment that is followed, null without one; see motion.js.
-  get end() {
-    return null;
-  }
-
-  // Return the target, LPS mm, null without one.
-  get target() {
-    return null;
-  }
-
   // The line of tubes and needle at their end.
   get devices() {
-    const { end } = this;
-    return end ? [...end.outer, ...end.middle, ...end.inner, ...end.needle] : [];
+    return this.end ? lineOf(this.end) : [];
   }
 
   // Name what can be fitted, target and devices beyond the scope, and these with the end of the scope; bring out what is near.

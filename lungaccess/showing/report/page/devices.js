@@ -9,6 +9,9 @@ const ALL = { scope: true, tubes: true, needle: true };
 const WHITE = [1, 1, 1];
 const LEAST_WIDTH = 0.0016, TARGET_MM = 1.6;
 
+// Return the line of tubes and needle in a state.
+export const lineOf = ({ outer, middle, inner, needle }) => [...outer, ...middle, ...inner, ...needle];
+
 // Return radii that can be seen from a distance.
 function thickened(radius, distance) {
   return Object.fromEntries(Object.entries(radius).map(([key, mm]) => [key, Math.max(mm, LEAST_WIDTH * distance)]));
@@ -34,7 +37,7 @@ export function showOther(scene, name, number, plan, end, distance, shown = ALL)
   put(scene, name, end, (solids) => {
     const radius = thickened(plan.radius_mm, distance), { colour, bands } = planStyle(number);
     const parts = [
-      ["scope", end.scope, 0.6 * radius.scope], ["tubes", [...end.outer, ...end.middle, ...end.inner], 0.8 * radius.inner],
+      ["scope", end.scope, 0.6 * radius.scope], ["tubes", lineOf({ ...end, needle: [] }), 0.8 * radius.inner],
       ["needle", end.needle, 0.8 * radius.needle],
     ];
     for (const [kind, points, mm] of parts.filter(([each]) => shown[each])) {
@@ -59,7 +62,7 @@ export function deviceLines({ radius_mm: radius }, state, shown = ALL) {
 export function otherLines({ radius_mm: radius }, end, number) {
   const { colour } = planStyle(number);
   return [
-    { points: [...end.outer, ...end.middle, ...end.inner], radius: radius.inner, colour },
+    { points: lineOf({ ...end, needle: [] }), radius: radius.inner, colour },
     { points: end.needle, radius: radius.needle, colour },
   ].filter(({ points }) => points.length > 1);
 }

@@ -46,13 +46,16 @@ export class Motion {
     let stage = STAGES.length - 1;
     while (stage > 0 && (share[stage] <= 0 || starts[stage] === starts[stage + 1])) stage -= 1;
     const moved = this.routeMm[this.routeMm.length - 1] * share[0];
-    const scopeMm = this.inserted(moved);
+    // How much of the scope is in, with its bending section.
+    const scopeMm = between(this.insertedMm, this.routeMm, moved);
     const flush = ends.outer * (starts[1] === starts[2] ? 1 : share[1]);
     const innerMm = share[2] > 0 ? ends.outer + (ends.inner - ends.outer) * share[2] : flush;
     const needleMm = ends.needle * share[3];
     const state = { position, stage, moved, scopeMm, outerMm: Math.min(flush, ends.outer), innerMm, needleMm };
-    state.scope = this.body(moved, scopeMm);
-    state.camera = this.camera(moved);
+    const shaft = cut(this.shaft, this.shaftMm, scopeMm - this.insertedMm[0]);
+    state.scope = [...shaft, ...row(this.sections, this.routeMm, moved, this.sectionPoints)];
+    const [eye, forward, up] = [this.route, this.forward, this.up].map((array) => row(array, this.routeMm, moved)[0]);
+    state.camera = { eye, forward: unit(forward), up: unit(up) };
     [state.outer, state.middle, state.inner] = share[0] < 1 ? [[], [], []] : this.tube(innerMm);
     state.needle = needleMm > 0 ? cut(this.needle, this.needleMm, needleMm) : [];
     state.needleColours = state.needle.map((_, n) => marginColour(margin[Math.min(n, margin.length - 1)]));
@@ -62,29 +65,12 @@ export class Motion {
     return state;
   }
 
-  // Return how much of the scope is in, with its bending section, after so much motion.
-  inserted(moved) {
-    return between(this.insertedMm, this.routeMm, moved);
-  }
-
-  // Return the points of the shaft and of the bending section before it.
-  body(moved, scopeMm) {
-    const shaft = cut(this.shaft, this.shaftMm, scopeMm - this.insertedMm[0]);
-    return [...shaft, ...row(this.sections, this.routeMm, moved, this.sectionPoints)];
-  }
-
-  camera(moved) {
-    const [eye, forward, up] = [this.route, this.forward, this.up].map((array) => row(array, this.routeMm, moved)[0]);
-    return { eye, forward: unit(forward), up: unit(up) };
-  }
-
   // Return the points of the outer tube, and of what the middle and the inner one reach beyond it.
   tube(innerMm) {
     const count = this.tubePoints, points = row(this.tubes, this.innerMm, innerMm, count);
     const ends = [this.outerMm, this.middleMm].map((mm) => between(mm, this.innerMm, innerMm));
     const [outer, middle] = ends.map((mm) => {
-      const at = innerMm > 0 ? (mm / innerMm) * (count - 1) : 0;
-      const whole = Math.min(Math.floor(at), count - 1);
+      const at = innerMm > 0 ? (mm / innerMm) * (count - 1) : 0, whole = Math.min(Math.floor(at), count - 1);
       return { whole, border: mix(points[whole], points[Math.min(whole + 1, count - 1)], at - whole) };
     });
     return [

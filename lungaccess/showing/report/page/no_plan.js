@@ -1,10 +1,10 @@
 // The page of a search that found no plan.
-import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { AnatomyPage, openPage } from "./anatomy_page.js";
 import { reportData, unpack } from "./decode.js";
 import { showBall } from "./devices.js";
 import { STANDARD } from "./slices.js";
 import { Solids } from "./solids.js";
-import { addSwitch } from "./structures.js";
+import { addSwitch, byId } from "./structures.js";
 import { minus, norm, point, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 

@@ -1,15 +1,15 @@
 // The page of a plan.
-import { byId, openPage } from "./anatomy_page.js";
+import { openPage } from "./anatomy_page.js";
 import { Breath } from "./breath.js";
 import { bifurcationsAhead, Bronchoscopy, pausesOf } from "./bronchoscopy.js";
 import { planStyle } from "./colours.js";
 import { reportData } from "./decode.js";
 import { DevicePage } from "./device_page.js";
-import { deviceLines, showBall, showDevices, showOther } from "./devices.js";
+import { deviceLines, lineOf, showBall, showDevices, showOther } from "./devices.js";
 import { Motion, STAGES } from "./motion.js";
 import { bendOf, planeAcross, planeAlong, STANDARD } from "./slices.js";
 import { Animated, Player } from "./player.js";
-import { addSwitch } from "./structures.js";
+import { addSwitch, byId } from "./structures.js";
 import { alongLine } from "./surfaces.js";
 import { TipSection } from "./tip_section.js";
 import { cross, dot, minus, mix, norm } from "./vectors.js";
@@ -262,7 +262,7 @@ class PlanPage extends DevicePage {
 
   // The plane across the foremost tip, or across the devices where they are nearest to the cross.
   across(state, following) {
-    const widthMm = Math.min(this.views.widthMm, MOST_ACROSS_MM), line = wholeLine(state);
+    const widthMm = Math.min(this.views.widthMm, MOST_ACROSS_MM), line = [...state.scope, ...lineOf(state)];
     if (following) return { ...planeAcross(state.direction), through: state.tip, widthMm };
     const { place, direction } = alongLine(line, this.views.place);
     return { ...planeAcross(direction), through: place, widthMm };
@@ -323,11 +323,6 @@ function swatchOf({ colour, bands }) {
   if (!bands) return colour;
   const px = (mm) => `${1.5 * mm}px`, [on, off] = bands;
   return `repeating-linear-gradient(90deg, ${colour} 0 ${px(on)}, #ffffff ${px(on)} ${px(on + off)})`;
-}
-
-// Return the line of everything that is out, from the scope on.
-function wholeLine({ scope, outer, middle, inner, needle }) {
-  return [...scope, ...outer, ...middle, ...inner, ...needle];
 }
 
 openPage(new PlanPage(reportData()));

@@ -1,5 +1,5 @@
 // The player of a deployment: its slider, the button that plays it, and pauses on the way.
-import { byId } from "./anatomy_page.js";
+import { byId } from "./structures.js";
 
 const PLAY_S = 14, MOST_STEP_S = 0.25;
 

@@ -1,9 +1,9 @@
 // The page of a reachability map.
-import { AnatomyPage, byId, openPage } from "./anatomy_page.js";
+import { AnatomyPage, openPage } from "./anatomy_page.js";
 import { VIRIDIS } from "./colours.js";
 import { reportData, unpack } from "./decode.js";
 import { STANDARD } from "./slices.js";
-import { addSwitch } from "./structures.js";
+import { addSwitch, byId } from "./structures.js";
 import { minus, norm, ramp, rgb } from "./vectors.js";
 import { VoxelImage } from "./voxel_image.js";
 import { nearest, VoxelGrid, volumeOf } from "./voxels.js";

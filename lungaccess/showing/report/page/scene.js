@@ -26,21 +26,11 @@ export class Scene {
     // The picture is kept after it was shown, so that the page can be printed.
     this.gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
     if (!this.gl) throw new Error("WebGL 2 is not available");
-    this.programs = programs(this.gl);
-    this.layers = new Layers(this.gl);
-    this.surfaces = new Map();
-    this.solids = new Map();
-    this.points = new Map();
-    this.share = 0;
-    this.cut = null;
-    this.focus = null;
-    this.focused = true;
+    Object.assign(this, { programs: programs(this.gl), layers: new Layers(this.gl) });
+    Object.assign(this, { surfaces: new Map(), solids: new Map(), points: new Map(), low: [0, 0, 0], high: [0, 0, 0] });
+    Object.assign(this, { share: 0, cut: null, focus: null, focused: true, changes: 0 });
     // "moving", "rest" or "fine": how well a slow machine draws; a fast one always draws as well as it can.
-    this.quality = "rest";
-    this.slow = null;
-    this.low = [0, 0, 0];
-    this.high = [0, 0, 0];
-    this.changes = 0;
+    Object.assign(this, { quality: "rest", slow: null });
   }
 
   // Add a packed surface, which moves with the breath if there is one; resolves when it can be drawn.
@@ -66,7 +56,7 @@ export class Scene {
       faces,
     };
     this.surfaces.set(packed.key, surface);
-    this.enclose([packed.low_lps, packed.low_lps.map((low, axis) => low + packed.size_mm[axis])]);
+    this.enclose([...packed.low_lps, ...packed.low_lps.map((low, axis) => low + packed.size_mm[axis])]);
     this.focusOn(surface);
     this.changes += 1;
   }
@@ -84,7 +74,7 @@ export class Scene {
     const attributes = [solids.places, solids.normals, solids.colours].map((values) =>
       [new Float32Array(values), gl.FLOAT, false, 3, 0]);
     this.solids.set(name, uploaded(gl, attributes, new Uint32Array(solids.faces)));
-    if (name !== INSIDE) this.enclose(corners(solids.places));
+    if (name !== INSIDE) this.enclose(solids.places);
   }
 
   // Put coloured points under a name, or take them away with null: places `3 N` in LPS mm, colours `3 N` from 0 to 1,
@@ -100,7 +90,7 @@ export class Scene {
       [Uint8Array.from(points.colours, (value) => Math.round(255 * value)), gl.UNSIGNED_BYTE, true, 3, 0],
     ];
     this.points.set(name, { ...uploaded(gl, attributes), count, places, radii });
-    this.enclose(corners(places));
+    this.enclose(places);
   }
 
   remove(map, name) {
@@ -133,12 +123,14 @@ export class Scene {
     gl.bindVertexArray(null);
   }
 
-  // Let the depth reach over a box, a little more than needed, so that it seldom changes.
-  enclose([low, high]) {
-    const empty = this.low.every((each, axis) => each === this.high[axis]);
+  // Let the depth reach over flat points, a little more than needed, so that it seldom changes.
+  enclose(flat) {
+    const isEmpty = this.low.every((each, axis) => each === this.high[axis]);
     for (let axis = 0; axis < 3; axis++) {
-      if (empty || low[axis] < this.low[axis]) this.low[axis] = low[axis] - SLACK_MM;
-      if (empty || high[axis] > this.high[axis]) this.high[axis] = high[axis] + SLACK_MM;
+      let low = Infinity, high = -Infinity;
+      for (let n = axis; n < flat.length; n += 3) [low, high] = [Math.min(low, flat[n]), Math.max(high, flat[n])];
+      if (isEmpty || low < this.low[axis]) this.low[axis] = low - SLACK_MM;
+      if (isEmpty || high > this.high[axis]) this.high[axis] = high + SLACK_MM;
     }
   }
 
@@ -271,16 +263,6 @@ export class Scene {
     bind();
   }
 
-  // Return what is under a place of the canvas, in pixels of the page from its upper left; picking.js says what.
-  pick(x, y, options) {
-    return pick(this, x, y, options);
-  }
-
-  // Return where a point is in the picture, in pixels of the page from its upper left; null behind the camera.
-  project(point) {
-    return project(this, point);
-  }
-
   // Draw the airway from inside into a square of the canvas, and copy it to another one.
   drawInside(pose, devices, target) {
     const gl = this.gl;
@@ -336,28 +318,29 @@ export class Scene {
     const gl = this.gl;
     program({ low: surface.low, size: surface.size, share: this.share });
     gl.bindVertexArray(surface.array);
-    if (isCoarse) this.useCoarse(surface);
-    gl.drawElements(gl.TRIANGLES, isCoarse ? surface.coarse.count : surface.count, gl.UNSIGNED_INT, 0);
-    if (isCoarse) gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.fine);
+    if (isCoarse) surface.coarse ??= this.coarseOf(surface);
+    const drawn = isCoarse ? surface.coarse : surface;
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, drawn.corners);
+    gl.drawElements(gl.TRIANGLES, drawn.count, gl.UNSIGNED_INT, 0);
   }
 
-  // Draw fewer triangles of a surface, which are made when they are first wanted.
-  useCoarse(surface) {
-    const gl = this.gl;
-    if (surface.coarse) return gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, surface.coarse.buffer);
-    const faces = coarser(surface.places, surface.faces, surface.size);
-    surface.coarse = { buffer: buffered(gl, gl.ELEMENT_ARRAY_BUFFER, faces), count: faces.length };
-    return surface.buffers.push(surface.coarse.buffer);
+  // Return fewer triangles of a surface, for when it is drawn in a hurry.
+  coarseOf({ places, faces, size, buffers }) {
+    const few = coarser(places, faces, size), corners = buffered(this.gl, this.gl.ELEMENT_ARRAY_BUFFER, few);
+    buffers.push(corners);
+    return { corners, count: few.length };
   }
 }
+
+Object.assign(Scene.prototype, { pick, project });
 
 // Return a vertex array of attributes and, if there are any, of faces, with its buffers.
 function uploaded(gl, attributes, faces = []) {
   const array = gl.createVertexArray();
   gl.bindVertexArray(array);
-  const buffers = attributes.map((each, n) => attribute(gl, n, ...each)), fine = faces.length ? buffered(gl, gl.ELEMENT_ARRAY_BUFFER, faces) : null;
+  const buffers = attributes.map((each, n) => attribute(gl, n, ...each)), corners = faces.length ? buffered(gl, gl.ELEMENT_ARRAY_BUFFER, faces) : null;
   gl.bindVertexArray(null);
-  return { array, buffers: [...buffers, fine], fine, count: faces.length };
+  return { array, buffers: [...buffers, corners], corners, count: faces.length };
 }
 
 function attribute(gl, place, values, type, normalised, size, stride) {
@@ -373,18 +356,6 @@ function buffered(gl, kind, values) {
   gl.bindBuffer(kind, buffer);
   gl.bufferData(kind, values, gl.STATIC_DRAW);
   return buffer;
-}
-
-// Return the low and the high corner of flat points.
-function corners(flat) {
-  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-  for (let n = 0; n < flat.length; n += 3) {
-    for (let axis = 0; axis < 3; axis++) {
-      low[axis] = Math.min(low[axis], flat[n + axis]);
-      high[axis] = Math.max(high[axis], flat[n + axis]);
-    }
-  }
-  return [low, high];
 }
 
 // Return how far the camera has to be from the middle of a ball to see it whole.

@@ -1,23 +1,21 @@
 // The controls of slices (slices.html): field, window, what a drag does, opacities, and what is under the pointer.
-import { made, swatch } from "./structures.js";
+import { byId, made, swatch } from "./structures.js";
 import { minus, norm } from "./vectors.js";
-
-const panelField = (id) => document.getElementById(id);
 
 // Connects the controls with slices.
 export class SlicePanel {
   // said(place): further words about a place, such as its distance from the target.
   constructor(views, said = () => []) {
     Object.assign(this, { views, said });
-    const { image } = views, on = (id, act) => panelField(id).addEventListener("change", ({ target }) => act(target));
-    panelField("ct-controls").hidden = !image.hasCt;
-    if (!image.hasCt) panelField("drag").querySelector("[value=window]").remove();
+    const { image } = views, on = (id, act) => byId(id).addEventListener("change", ({ target }) => act(target));
+    byId("ct-controls").hidden = !image.hasCt;
+    if (!image.hasCt) byId("drag").querySelector("[value=window]").remove();
     on("drag", ({ value }) => this.chooseDrag(value));
     on("field", ({ value }) => value && views.setWidth(Number(value)));
     on("window", ({ value }) => this.changeWindow(() => image.setWindow(value)));
     for (const id of ["window-level", "window-width"]) {
       on(id, () => this.changeWindow(() => {
-        const [level, width] = [panelField("window-level"), panelField("window-width")].map((field) => Number(field.value));
+        const [level, width] = [byId("window-level"), byId("window-width")].map((field) => Number(field.value));
         if (Number.isFinite(level) && width > 0) image.setLevels(level, width);
       }));
     }
@@ -43,14 +41,14 @@ export class SlicePanel {
   // Write the window into its fields.
   showWindow() {
     const { image } = this.views, { level, width } = image.levels;
-    panelField("window").value = image.windowName || "free";
-    panelField("window-level").value = Math.round(level);
-    panelField("window-width").value = Math.round(width);
+    byId("window").value = image.windowName || "free";
+    byId("window-level").value = Math.round(level);
+    byId("window-width").value = Math.round(width);
   }
 
   // Write the width of the pictures into its field, and say what is at the pointer or the cross.
   show() {
-    const field = panelField("field"), { widthMm } = this.views, known = [...field.options].find((option) => Number(option.value) === widthMm);
+    const field = byId("field"), { widthMm } = this.views, known = [...field.options].find((option) => Number(option.value) === widthMm);
     const free = field.querySelector("option[value='']");
     free.textContent = known ? "other" : `${widthMm.toFixed(0)} mm`;
     field.value = known ? known.value : "";
@@ -66,7 +64,7 @@ export class SlicePanel {
       this.views.image.setOpacity(name, Number(slider.value) / 100);
       this.views.changed();
     });
-    panelField("opacities").append(made("li", {}, made("label", {}, swatch(colour), name, slider)));
+    byId("opacities").append(made("li", {}, made("label", {}, swatch(colour), name, slider)));
   }
 
   // Say what is at a place: of the pointer, or of the cross when there is none.
@@ -74,7 +72,7 @@ export class SlicePanel {
     this.pointer = place ? { place, name } : null;
     const { views } = this, { image } = views, at = place || views.place;
     const hu = name && place ? views.slices[name].huAt(at) : image.huAt(at), voxel = image.grid.voxel(image.inMasks(at));
-    panelField("under-pointer").textContent = [
+    byId("under-pointer").textContent = [
       `${place ? "Pointer" : "Cross"}: LPS ${at.map((value) => value.toFixed(1)).join(", ")} mm`,
       voxel ? `voxel ${voxel.join(", ")}` : "beyond the image",
       image.structureAt(at),

@@ -67,10 +67,9 @@ export class SliceViews {
   }
 
   zoom(factor, about = this.centre) {
-    const width = Math.min(Math.max(this.widthMm * factor, LEAST_MM), MOST_MM);
-    this.centre = add(about, times(minus(this.centre, about), width / this.widthMm));
-    this.widthMm = width;
-    this.changed();
+    const before = this.widthMm;
+    this.setWidth(before * factor);
+    this.centre = add(about, times(minus(this.centre, about), this.widthMm / before));
   }
 
   // Draw planes: { name: { right, up, through, widthMm } }, through the cross and as wide as all if they do not say.

@@ -69,7 +69,7 @@ export class Slice {
   raster() {
     const { width, height } = this.canvas, { right, up, scale } = this.plane;
     return {
-      origin: this.pixelCentre(0, 0, 1 / scale), across: times(right, 1 / scale), down: times(up, -1 / scale), columns: width, rows: height,
+      origin: this.pointAt(0.5, 0.5), across: times(right, 1 / scale), down: times(up, -1 / scale), columns: width, rows: height,
     };
   }
 
@@ -138,9 +138,9 @@ export class Slice {
     if (!this.pixels || this.pixels.width !== width || this.pixels.height !== height) this.pixels = this.pen.createImageData(width, height);
     const { data } = this.pixels, words = new Uint32Array(data.buffer);
     const across = times(this.plane.right, many * step);
-    const shifts = this.shifts(width, height, step);
+    const shifts = this.shifts(width, height);
     for (let row = 0; row < height; row += many) {
-      let [x, y, z] = this.pixelCentre(0, row, step);
+      let [x, y, z] = this.pointAt(0.5, row + 0.5);
       for (let column = 0; column < width; column += many) {
         const at = row * width + column, [sx, sy, sz] = shifts ? shifts(column, row) : NOWHERE;
         this.image.paint(x + sx, y + sy, z + sz, data, 4 * at, values ? values[at] : undefined);
@@ -153,20 +153,15 @@ export class Slice {
     }
   }
 
-  pixelCentre(column, row, step) {
-    const { right, up, centre } = this.plane, { width, height } = this.canvas;
-    return add(centre, add(times(right, (column + 0.5 - width / 2) * step), times(up, (height / 2 - row - 0.5) * step)));
-  }
-
   // Return a function that tells by how much a pixel is pulled back to the masks, null in their phase.
   // It is computed at every so manieth pixel, and between them it is bilinear.
-  shifts(width, height, step) {
+  shifts(width, height) {
     const { breath, share } = this.image;
     if (!breath || share === 0) return null;
     const columns = Math.ceil(width / LATTICE_PIXELS) + 1, rows = Math.ceil(height / LATTICE_PIXELS) + 1;
     const known = new Float32Array(3 * columns * rows), out = [0, 0, 0];
     for (let n = 0; n < columns * rows; n++) {
-      const place = this.pixelCentre((n % columns) * LATTICE_PIXELS, Math.floor(n / columns) * LATTICE_PIXELS, step);
+      const place = this.pointAt((n % columns) * LATTICE_PIXELS + 0.5, Math.floor(n / columns) * LATTICE_PIXELS + 0.5);
       known.set(minus(breath.pulledBack(place, share), place), 3 * n);
     }
     return (column, row) => {
@@ -191,17 +186,15 @@ export class Slice {
     ];
   }
 
-  // Return the point of the plane at a pixel.
+  // Return the point of the plane at a place of the canvas; the centres of pixels are at halves.
   pointAt(column, row) {
-    const { right, up, centre, scale } = this.plane;
-    return add(centre, add(
-      times(right, (column - this.canvas.width / 2) / scale), times(up, (this.canvas.height / 2 - row) / scale)));
+    const { right, up, centre, scale } = this.plane, { width, height } = this.canvas, step = 1 / scale;
+    return add(centre, add(times(right, (column - width / 2) * step), times(up, (height / 2 - row) * step)));
   }
 
   // A device: full where it is near the plane, faint where it is not.
   line({ points, radius, colour }) {
-    const pen = this.pen;
-    const places = points.map((place) => this.project(place));
+    const { pen } = this, places = points.map((place) => this.project(place));
     pen.lineCap = pen.lineJoin = "round";
     pen.strokeStyle = colour;
     for (const near of [false, true]) {
@@ -220,8 +213,7 @@ export class Slice {
   }
 
   target(place) {
-    const [x, y, away] = this.project(place);
-    const pen = this.pen;
+    const [x, y, away] = this.project(place), { pen } = this;
     pen.globalAlpha = away <= NEAR_MM ? 1 : FAINT;
     for (const [colour, width] of [["#000000", 5], ["#39E0B0", 2.5]]) {
       pen.strokeStyle = colour;
@@ -251,8 +243,7 @@ export class Slice {
   }
 
   letters() {
-    const { right, up } = this.plane;
-    const { width, height } = this.canvas;
+    const { plane: { right, up }, canvas: { width, height } } = this;
     const edges = [
       [letters(times(right, -1)), 6, height / 2, "left"], [letters(right), width - 6, height / 2, "right"],
       [letters(up), width / 2, 16, "center"], [letters(times(up, -1)), width / 2, height - 16, "center"],

@@ -21,8 +21,7 @@ export class Solids {
   // A round tube along points; colours is one for all, or one for each point.
   tube(points, radius, colours) {
     if (points.length < 2) return;
-    let side = null;
-    let before = null;
+    let side = null, before = null;
     points.forEach((place, n) => {
       const forward = unit(minus(points[Math.min(n + 1, points.length - 1)], points[Math.max(n - 1, 0)]));
       const start = side || (Math.abs(forward[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]);

@@ -1,5 +1,10 @@
 // Elements of the page, and its switches: one labelled box for each thing that can be shown.
 
+export const byId = (id) => document.getElementById(id);
+
+// Return the transform that shifts an element by pixels of the page.
+export const shiftBy = (px) => `translate(${px.map((each) => `${each.toFixed(1)}px`)})`;
+
 // Return an element with properties or attributes, listeners ("on" and a name) and content; text is never markup.
 export function made(name, attributes = {}, ...content) {
   const element = document.createElement(name);

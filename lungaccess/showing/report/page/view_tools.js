@@ -1,7 +1,7 @@
 // What one does in the 3-D view besides turning it: point, measure, cut, and save a picture or a film.
 import { inscribe } from "./slices.js";
 import { Solids } from "./solids.js";
-import { made, oncePerFrame } from "./structures.js";
+import { made, oncePerFrame, shiftBy } from "./structures.js";
 import { add, dot, minus, norm, rgb, times, unit } from "./vectors.js";
 
 const MEASURE_INK = "#FFD23F";
@@ -29,15 +29,7 @@ export class ViewTools {
   }
 
   connectCut() {
-    const changed = () => {
-      this.find("cut-row").classList.toggle("off", !this.find("cut").checked);
-      this.page.redrawView();
-    };
-    for (const id of ["cut", "cut-offset"]) this.find(id).addEventListener("input", changed);
-    this.find("focus").addEventListener("input", () => {
-      this.page.scene.focused = this.find("focus").checked;
-      this.page.redrawView();
-    });
+    for (const id of ["cut", "cut-offset", "focus"]) this.find(id).addEventListener("input", () => this.page.redrawView());
   }
 
   // Bring the cut and the labels to the camera, before and after the picture.
@@ -47,6 +39,7 @@ export class ViewTools {
     this.find("cut-name").textContent = `Cut through ${through ? through.name : "it"}`;
     this.find("cut-words").textContent = offset ? `${Math.abs(offset)} mm ${offset < 0 ? "behind" : "before"} it` : "in it";
     this.find("focus-row").hidden = !this.page.scene.focus;
+    this.page.scene.focused = this.find("focus").checked;
     this.page.scene.setCut(on ? planeFacing(camera, through, offset) : null);
   }
 
@@ -54,7 +47,7 @@ export class ViewTools {
     const labels = [...this.page.labels(), ...this.measureLabel()];
     this.find("scene-labels").replaceChildren(...labels.flatMap(({ text, point, colour }) => {
       const at = this.page.scene.project(point);
-      return at ? made("span", { style: `border-color: ${colour}; transform: translate(${at.map((px) => `${px.toFixed(1)}px`)})` }, text) : [];
+      return at ? made("span", { style: `border-color: ${colour}; transform: ${shiftBy(at)}` }, text) : [];
     }));
   }
 
@@ -85,7 +78,7 @@ export class ViewTools {
     if (!this.hit) return;
     note.textContent = this.wordsOf(this.hit);
     const aside = x > this.canvas.clientWidth / 2 ? "calc(-100% - 12px)" : "14px";
-    note.style.transform = `translate(${x}px, ${y}px) translate(${aside}, 14px)`;
+    note.style.transform = `${shiftBy([x, y])} translate(${aside}, 14px)`;
   }
 
   leave() {

@@ -20,8 +20,8 @@ export class VoxelImage {
     image.grid = data.grid ? new VoxelGrid(data.grid.shape, data.grid.lps_from_ijk) : image.labels[0].grid;
     image.codes = data.codes;
     image.source = image.hasCt ? new PackedSource(image.ct) : null;
-    // A source that has more than the page; its slices are shown when they come.
-    image.finer = null;
+    // `finer` is a source that has more than the page; its slices are shown when they come.
+    Object.assign(image, { finer: null, overlay: null, breath: null, share: 0, tint: true });
     image.table = new Uint8Array(3 * 256);
     image.ground = new Uint8Array(256);
     image.tinted = new Uint8Array(256);
@@ -32,10 +32,6 @@ export class VoxelImage {
       image.tinted[code] = TINTED.includes(name) ? 1 : 0;
       image.opacity[code] = image.hasCt ? TINT * image.tinted[code] : 1;
     }
-    image.overlay = null;
-    image.breath = null;
-    image.share = 0;
-    image.tint = true;
     image.setWindow("lung");
     return image;
   }

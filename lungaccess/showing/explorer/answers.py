@@ -2,26 +2,26 @@
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anatomy.base.errors import LungaccessError, SettingsError
+from anatomy.base.errors import SettingsError
 from anatomy.base.kernel_clock import working_cpu_s
 from anatomy.base.typed import Float, Int
 from anatomy.base.words import plural
 from anatomy.grid import Volume
 from anatomy.lung import Lung
-from lungaccess.planning import ProgressEvent, run, tips_near
-from lungaccess.planning.coupled import Atlas, FeasibleExits, atlas_is_kept, feasible_exits, open_atlas
+from lungaccess.planning import run, tips_near
+from lungaccess.planning.coupled import Atlas, FeasibleExits, feasible_exits, open_atlas
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
-from lungaccess.problem import System, Target, describe_place, fissures_are_obstacles, load_patient
+from lungaccess.problem import System, describe_place, fissures_are_obstacles, load_patient
 from lungaccess.problem.goals import Goal
-from lungaccess.problem.request import Request, goal_of
+from lungaccess.problem.request import Request
 from lungaccess.showing.explorer import questions as ask
 from lungaccess.showing.explorer.changed_system import ChosenPlace, plan_command, system_of
 from lungaccess.showing.explorer.opening import looked, opened, outlined, with_nodule
@@ -84,7 +84,7 @@ class Answers:
             turn.check()
             if time.monotonic() - told >= TELL_EVERY_S:
                 told = time.monotonic()
-                turn.send(Part({"answer": "progress", "what": "deployment atlas", "share": round(share, 4)}))
+                turn.tell("deployment atlas", round(share, 4))
 
         if key not in self._atlases:
             self._atlases[key] = open_atlas(
@@ -113,18 +113,14 @@ class Answers:
     def _paint(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         """Correct the masks, then make lung and atlas anew here, so that the other processes find both."""
         question: ask.PaintQuestion = asked.question
-
-        def tell(what: str) -> None:
-            turn.send(Part({"answer": "progress", "what": what, "share": None}))
-
         if self._painting is None:
-            tell("reading the masks")
+            turn.tell("reading the masks")
             self._painting = Painting.of(self._source, self.lung)
         system = self._system(question.what_if)
         self._atlas(system, turn)
         around = question.points[-1] if question.points else tuple(self.lung.tree.carina_lps.tolist())
         size_ml = self._painting.draw(question, self._ct)
-        lung = self._painting.renewed(tell)
+        lung = self._painting.renewed(turn.tell)
         self.renew(self._source, lung)
         # Before the atlas, in which a later stroke may take the place of this one.
         turn.send(
@@ -236,6 +232,8 @@ class Answers:
         target = target_of(self.lung, question.target)
         atlas = self._atlas(system, turn)
         place = _place_of(atlas, question)
+        own = {each.name: path for path, each in self._source.own}
+        command = plan_command(self._source.patient, question, system, own, self._source.cache, place)
         request = Request.of(
             self.lung, system, target, goal=question.goal, seed=question.seed,
             iterations=question.iterations, place=None if place is None else place.stated,
@@ -244,61 +242,42 @@ class Answers:
         curve: list[tuple[float, float, float]] = []
         told, last, shown = -np.inf, None, None
 
-        def on_progress(_event: ProgressEvent) -> None:
-            turn.give_way()
+        def part(found: Plan, *, final: bool) -> Part:
+            """Return a plan for the page; one that it knows already without its curves."""
+            message = {
+                "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
+                "cost": float(found.cost), "goal": _goal_words(request.goal, found),
+                "iterations": found.iterations, "system": system.name, "way": _way_words(found, self.lung),
+                "cpu_s": working_cpu_s() - cpu_began, "command": command,
+                "needle_mm": None if found.needle is None else found.needle.length_mm,
+                "scope_tip_lps": np.asarray(found.scope.lps_from_scope_tip)[:3, 3].tolist(),
+                "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(), **_least_clearance(found),
+            }  # fmt: skip
+            if found is not shown:
+                message["packed"] = packed_plan(found, self.lung, "", sections=False)
+            kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
+            return Part(message, plan=kept)
 
         try:
-            for found in run(request, atlas=atlas, counterfactuals=False, on_progress=on_progress):
+            for found in run(
+                request, atlas=atlas, counterfactuals=False, on_progress=lambda _event: turn.give_way()
+            ):
                 last, value = found, request.goal.value(found)
                 if value is not None:
                     curve.append((time.monotonic() - began, float(found.iterations), value))
                 if time.monotonic() - told >= TELL_EVERY_S:
-                    told, shown = time.monotonic(), found
-                    yield self._plan_part(
-                        asked, found, curve, system, place, working_cpu_s() - cpu_began, final=False
-                    )
+                    told = time.monotonic()
+                    yield part(found, final=False)
+                    shown = found
                 else:
                     yield None
         except NoPlan as failure:
-            yield Part({"answer": "no_plan", "target_lps": target.lps_mm.tolist(), **_why(failure)})
+            reasons = {name: int(count) for name, count in failure.reasons.items() if count}
+            why = {"found": failure.found, "remedy": failure.remedy, "reasons": reasons}
+            yield Part({"answer": "no_plan", "target_lps": target.lps_mm.tolist(), **why})
             return
-        if last is None:
-            return
-        final = last if last.window is not None else with_window(last, self.lung)
-        cpu_s, known = working_cpu_s() - cpu_began, shown is final
-        yield self._plan_part(asked, final, curve, system, place, cpu_s, final=True, known=known)
-
-    def _plan_part(
-        self,
-        asked: Asked,
-        found: Plan,
-        curve: list[tuple[float, float, float]],
-        system: System,
-        place: ChosenPlace | None,
-        cpu_s: float,
-        *,
-        final: bool,
-        known: bool = False,
-    ) -> Part:
-        """Return a plan for the page; one that it knows already without its curves."""
-        question = asked.question
-        own = {each.name: path for path, each in self._source.own}
-        message = {
-            "answer": "plan", "final": final, "digest": found.digest, "curve": curve,
-            "cost": float(found.cost), "goal": _goal_words(goal_of(question.goal, self.lung), found),
-            "iterations": found.iterations, "system": system.name, "way": _way_words(found, self.lung),
-            "cpu_s": cpu_s, "needle_mm": None if found.needle is None else found.needle.length_mm,
-            "scope_tip_lps": np.asarray(found.scope.lps_from_scope_tip)[:3, 3].tolist(),
-            "exit_lps": np.asarray(found.tube.exit.point_lps).tolist(),
-            **_least_clearance(found),
-            "command": plan_command(
-                self._source.patient, question, system, own, self._source.cache, place
-            ),
-        }  # fmt: skip
-        if not known:
-            message["packed"] = packed_plan(found, self.lung, "", sections=False)
-        kept = KeptPlan(digest=found.digest, text=found.to_json(), curve=tuple(curve))
-        return Part(message, plan=kept)
+        if last is not None:
+            yield part(last if last.window is not None else with_window(last, self.lung), final=True)
 
     def _reach(self, asked: Asked, turn: Turn) -> Iterator[Part | None]:
         from lungaccess.showing.explorer.exports import reach_parts
@@ -330,21 +309,14 @@ class Answers:
         from lungaccess.showing.explorer.exports import explanation_part
 
         system = self._system(asked.question.what_if)
-        target: Target = target_of(self.lung, asked.question.target)
-        own = self._atlas(system, turn)
-
-        def atlas_of(other: System, progress: Callable[[float], None]) -> Atlas:
-            return open_atlas(self.lung, other, cache=self._source.cache, progress=progress)
-
-        def is_kept(other: System) -> bool:
-            return atlas_is_kept(self.lung, other, cache=self._source.cache)
-
-        yield explanation_part(self.lung, system, target, asked.question, own, atlas_of, is_kept, turn)
+        target, atlas = target_of(self.lung, asked.question.target), self._atlas(system, turn)
+        cache = self._source.cache
+        yield explanation_part(self.lung, system, target, asked.question, atlas, cache, turn)
 
     def _export(self, asked: Asked, turn: Turn) -> Iterator[Part]:
         from lungaccess.showing.explorer.exports import export_file
 
-        turn.send(Part({"answer": "progress", "what": f"making {asked.question.what}", "share": None}))
+        turn.tell(f"making {asked.question.what}")
         found = self._plan_asked(asked)
         curve = () if asked.plan is None else asked.plan.curve
         file = export_file(found, self.lung, asked.question.what, self._folder, curve, self._source.ct)
@@ -362,8 +334,7 @@ class Answers:
 def _place_of(atlas: Atlas, question: ask.PlanQuestion) -> ChosenPlace | None:
     """Return the place that a plan is asked to go through: the exit of a deployment, or a tip of the scope.
 
-    Raises:
-        SettingsError: If the atlas has no such deployment or tip.
+    Raises SettingsError if the atlas has no such deployment or tip.
     """
     if question.entry is not None:
         _require_below(question.entry, atlas.deployments.count, "deployment")
@@ -427,13 +398,3 @@ def _way_words(found: Plan, lung: Lung) -> str:
         f"scope {scope.length_from_carina_mm:.0f} mm beyond the carina; out of airway "
         f"{lung.branch_words(found.tube.exit.branch)}; {found.insertions}; {last}"
     )
-
-
-def _why(failure: LungaccessError) -> dict[str, Any]:
-    """Return why there is no plan, as `NoPlan` says it."""
-    reasons = getattr(failure, "reasons", {})
-    return {
-        "found": failure.found,
-        "remedy": failure.remedy,
-        "reasons": {name: int(count) for name, count in reasons.items() if count},
-    }

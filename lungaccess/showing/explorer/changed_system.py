@@ -24,12 +24,11 @@ from lungaccess.showing.explorer.questions import PlanQuestion, WhatIf
 def system_of(what_if: WhatIf, own: Mapping[str, System]) -> System:
     """Return the system of a question.
 
+    Raises SettingsError if there is no such system, it cannot have the change, or one device then does not
+    fit the other.
+
     Args:
         own: Systems by name that are no presets.
-
-    Raises:
-        SettingsError: If there is no such system, it cannot have the change, or one device then does not fit
-            the other.
     """
     system = own.get(what_if.system)
     if system is None:

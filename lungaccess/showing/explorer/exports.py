@@ -6,7 +6,8 @@ command, and never more than is proved.  Reach comes voxel by voxel, from the ta
 
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Iterator, MutableMapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from lungaccess.judging.advice import advise
 from lungaccess.judging.appraisal import Appraisal, appraise, plan_record
 from lungaccess.judging.explanation import DEFAULT_TIME_S, explain_no_plan, sections
 from lungaccess.planning import run
-from lungaccess.planning.coupled import Atlas
+from lungaccess.planning.coupled import Atlas, atlas_is_kept, open_atlas
 from lungaccess.planning.reachability import KINDS, ReachStream
 from lungaccess.plans.no_plan import NoPlan
 from lungaccess.plans.plan import Plan
@@ -55,8 +56,7 @@ def export_file(
 ) -> Path:
     """Write one of `lungaccess.showing.explorer.questions.FileKind` into a new folder in a folder.
 
-    Raises:
-        FileError: If it cannot be written.
+    Raises FileError if it cannot be written.
     """
     made = Path(tempfile.mkdtemp(dir=folder))
     file = made / what
@@ -73,12 +73,10 @@ def export_file(
     elif what == "report.html":
         history = made / "cost_over_time.csv"
         report.cost_over_time_csv(points, history)
-        image = None if ct is None else ct.read()
-        name = "" if ct is None else ct.path.name
+        image, name = (None, "") if ct is None else (ct.read(), ct.path.name)
         advice = advise(plan, lung, appraise(plan, lung), time_s=ADVICE_S)
-        plan_page(
-            plan, lung, file, PageOptions(ct=image, ct_name=name, cost_over_time=history, advice=advice)
-        )
+        options = PageOptions(ct=image, ct_name=name, cost_over_time=history, advice=advice)
+        plan_page(plan, lung, file, options)
     elif what == "overview.png":
         report.overview_png(plan, lung, file, appraise(plan, lung))
     elif what == "tree.png":
@@ -114,52 +112,29 @@ def explanation_part(
     target: Target,
     question: ExplainQuestion,
     atlas: Atlas,
-    atlas_of: Callable[[System, Callable[[float], None]], Atlas],
-    is_kept: Callable[[System], bool],
+    cache: Path | None,
     turn: Turn,
 ) -> Part:
-    """Return headline and sections of an explanation.
-
-    Raises:
-        SettingsError: If there is a plan.
-    """
+    """Return headline and sections of an explanation.  Raises SettingsError if there is a plan."""
 
     def on_part(name: str) -> None:
         turn.check()
-        turn.send(Part({"answer": "progress", "what": name, "share": None}))
+        turn.tell(name)
 
+    goal, seed = question.objective, question.seed
+    request = Request.of(lung, system, target, goal=goal, seed=seed, iterations=ITERATIONS)
     try:
-        next(
-            run(
-                Request.of(
-                    lung, system, target, goal=question.objective, seed=question.seed, iterations=ITERATIONS
-                ),
-                atlas=atlas,
-                counterfactuals=False,
-                on_progress=lambda _event: turn.check(),
-            )
-        )
+        next(run(request, atlas=atlas, counterfactuals=False, on_progress=lambda _event: turn.check()))
     except NoPlan as failure:
         made = explain_no_plan(
-            lung, system, target, failure, atlas=atlas, objective=question.objective, seed=question.seed,
-            time_s=DEFAULT_TIME_S, atlas_of=atlas_of, is_kept=is_kept, on_part=on_part,
+            lung, system, target, failure, atlas=atlas, objective=goal, seed=seed, time_s=DEFAULT_TIME_S,
+            atlas_of=lambda other, progress: open_atlas(lung, other, cache=cache, progress=progress),
+            is_kept=lambda other: atlas_is_kept(lung, other, cache=cache), on_part=on_part,
         )  # fmt: skip
     else:
         raise SettingsError("There is a plan to this target", remedy="Ask for it")
-    return Part(
-        {
-            "answer": "explanation",
-            "headline": made.headline,
-            "sections": [
-                {
-                    "title": each.title,
-                    "headings": list(each.headings),
-                    "rows": [list(row) for row in each.rows],
-                }
-                for each in sections(made)
-            ],
-        }
-    )
+    told = [asdict(each) for each in sections(made)]
+    return Part({"answer": "explanation", "headline": made.headline, "sections": told})
 
 
 def reach_parts(

@@ -21,10 +21,8 @@ def frame(message: Message, arrays: Mapping[str, Array] | None = None) -> Frame:
     """Return a message as it is sent.
 
     With arrays it is binary: the length of the JSON as a little-endian uint32, the JSON, whose "arrays" list
-    name, kind ("u1", "u2", "i4" or "f4"), shape and offset of each, and the arrays, little-endian.
-
-    Raises:
-        ValueError: If a number of the message is not finite.
+    name, kind ("u1", "u2", "i4" or "f4"), shape and offset of each, and the arrays, little-endian.  Raises
+    ValueError if a number of the message is not finite.
     """
     if not arrays:
         return _json(message)

@@ -57,8 +57,7 @@ OUTLINE_MM = 45.0
 def looked(question: LookQuestion) -> Part:
     """Return what lies in a folder: its folders, and the images in it; where none is named, in this one.
 
-    Raises:
-        FileError: If there is no such folder, or it cannot be read.
+    Raises FileError if there is no such folder, or it cannot be read.
     """
     path = _path(question.path)
     folder = path if path.is_dir() else path.parent
@@ -84,19 +83,18 @@ def looked(question: LookQuestion) -> Part:
 def opened(question: OpenQuestion, source: PatientSource, folder: Path, turn: Turn) -> Iterator[Part]:
     """Yield the series of a CT, or the masks made from it, or the patient that is explored from now on.
 
+    Raises LungaccessError if it is no CT and no patient, and nothing that a person may accept helps.
+
     Args:
         source: What the explorer was started with.
         folder: Where pictures for the page are written.
-
-    Raises:
-        LungaccessError: If it is no CT and no patient, and nothing that a person may accept helps.
     """
     path = _path(question.path)
     try:
         if is_ct(path):
             yield from _segmented(path, question, folder, turn)
             return
-        turn.send(_progress("reading the patient", None))
+        turn.tell("reading the patient")
         if not question.thick_slices:
             require_thin_slices(path)
         yield _exploring(path, replace(source, accept=(*source.accept, *question.accept)), turn)
@@ -121,12 +119,12 @@ def _segmented(path: Path, question: OpenQuestion, folder: Path, turn: Turn) -> 
 
     series = question.series or None
     if path.is_dir() and series is None:
-        turn.send(_progress("reading the series", None))
+        turn.tell("reading the series")
         found = list_series(path)
         if len(found) > 1:
             yield from _series_parts(found)
             return
-    turn.send(_progress("reading the CT", 0.0))
+    turn.tell("reading the CT", 0.0)
     volume, sources = read_ct(path, series)
     request = SegmentationRequest(
         ct=volume, out=patient_folder(path, series).resolve(), sources=sources, ct_path=path,
@@ -178,29 +176,26 @@ def _bytes_of(hu: Float32) -> UInt8:
     return picture
 
 
-def _exploring(path: Path, source: PatientSource, turn: Turn, target: str = "") -> Part:
+def _exploring(path: Path, source: PatientSource, turn: Turn) -> Part:
     """Return the part after which a patient is explored; it is prepared and kept here, with its progress."""
     ct = find_ct(path)
     if ct is not None and ct.path.exists():
         ct.read()  # Here, where a file that is none is refused before anything is shown.
     else:
         ct = None
-    lung = load_patient(
-        path, cache=source.cache, accept=source.accept, progress=lambda step: turn.send(_progress(step, None))
-    )
+    lung = load_patient(path, cache=source.cache, accept=source.accept, progress=turn.tell)
     made = replace(source, folder=path, ct=ct)
-    return Part({"answer": "opened", "patient": lung.name, "target": target}, source=made)
+    return Part({"answer": "opened", "patient": lung.name, "target": ""}, source=made)
 
 
 def outlined(lung: Lung, ct: Volume, point_lps: Float) -> tuple[Lung, dict[str, Any]]:
     """Outline the nodule at a point at once.
 
+    Raises AnatomyError if there is no nodule that can be told from vessels and chest wall.
+
     Returns:
         - Lung - The patient as slices are to show it, with this nodule alone; nothing is planned on it.
         - dict - The volume in ml, and the diameter in mm of the ball with that volume.
-
-    Raises:
-        AnatomyError: If there is no nodule that can be told from vessels and chest wall.
     """
     box = lung.grid.window(point_lps + np.array([[-OUTLINE_MM], [OUTLINE_MM]]), 0.0)
     grid = lung.grid.crop([each.start for each in box], [each.stop for each in box])
@@ -274,8 +269,7 @@ def nodule_near(lung: Lung, point_lps: Float) -> int | None:
 def segmentation_record(folder: Path) -> dict[str, Any] | None:
     """Return with what a folder was segmented; None if it was not.
 
-    Raises:
-        FileError: If the record is damaged.
+    Raises FileError if the record is damaged.
     """
     if not (folder / STATE).is_file():
         return None
@@ -296,10 +290,6 @@ def _path(text: str) -> Path:
     return path
 
 
-def _progress(what: str, share: float | None) -> Part:
-    return Part({"answer": "progress", "what": what, "share": share})
-
-
 def _words_of_page(warning: str) -> str:
     """Return a warning as the page has its remedy: options of a command are none of a person's there."""
     place = re.sub(r"add --nodule (\S+?)\.$", r"put the cross to \1 and outline it.", warning)
@@ -318,7 +308,7 @@ def _made(request: SegmentationRequest, turn: Turn, folder: Path | None) -> Segm
 
     def tell(step: str, share: float | None) -> None:
         turn.check()
-        turn.send(_progress(step, share))
+        turn.tell(step, share)
 
     mark = require_writable_folder(request.out) / MARK
     mark.mkdir(exist_ok=True)

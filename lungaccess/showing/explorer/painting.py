@@ -49,8 +49,7 @@ class Painting:
     def of(cls, source: PatientSource, lung: Lung) -> "Painting":
         """Return the masks of a patient, ready to be corrected.
 
-        Raises:
-            LungaccessError: As `anatomy.io.load_patient`.
+        Raises LungaccessError as `anatomy.io.load_patient`.
         """
         made = load_patient(source.patient, as_made=True)
         values = np.zeros(made.grid.shape, dtype=np.uint8, order="F")
@@ -64,8 +63,7 @@ class Painting:
     def draw(self, question: PaintQuestion, ct: Callable[[], Volume]) -> float:
         """Correct what a stroke means, and return how many ml it changes; a fill and a bridge need the CT.
 
-        Raises:
-            SettingsError: If the stroke means nothing, or there is none to be taken back.
+        Raises SettingsError if the stroke means nothing, or there is none to be taken back.
         """
         if question.tool == "undo":
             return self._undo()
@@ -120,8 +118,7 @@ class Painting:
     def renewed(self, tell: Callable[[str], Any]) -> Lung:
         """Keep the corrections with the patient, and return its lung as it now is.
 
-        Raises:
-            LungaccessError: If the masks can no longer be those of a patient: the stroke is taken back.
+        Raises LungaccessError if the masks can no longer be those of a patient: the stroke is taken back.
         """
         file = corrections_file(self.source.patient)
         write_corrections(file, Volume(grid=self.made.grid, array=self.values))

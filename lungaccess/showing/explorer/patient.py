@@ -26,8 +26,7 @@ NODULE = "nodule"
 def target_of(lung: Lung, text: str) -> Target:
     """Return the target that a text names: `nodule N`, a point with its frame, or a published name.
 
-    Raises:
-        LungaccessError: As `lungaccess.problem.resolve_target`.
+    Raises LungaccessError as `lungaccess.problem.resolve_target`.
     """
     kind, _, number = text.partition(" ")
     if kind == NODULE and number.isdecimal():
@@ -40,16 +39,12 @@ def patient_facts(lung: Lung, source: PatientSource) -> dict[str, Any]:
     own = {system.name: system for _path, system in source.own}
     systems = own | {name: load_system(name) for name in preset_names()}
     return {
-        "patient": lung.name,
-        "folder": str(source.patient),
-        "warnings": list(lung.warnings),
+        "patient": lung.name, "folder": str(source.patient), "warnings": list(lung.warnings),
         "has_ct": source.ct is not None,
         "may_outline": source.ct is not None and (source.patient / STATE).is_file(),
-        "carina_lps": np.asarray(lung.tree.carina_lps).tolist(),
-        "targets": _targets(lung),
-        "first_system": source.system,
-        "systems": [_system(system) for system in systems.values()],
-    }
+        "carina_lps": np.asarray(lung.tree.carina_lps).tolist(), "targets": _targets(lung),
+        "first_system": source.system, "systems": [_system(system) for system in systems.values()],
+    }  # fmt: skip
 
 
 def _targets(lung: Lung) -> list[dict[str, Any]]:

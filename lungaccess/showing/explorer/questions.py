@@ -61,7 +61,7 @@ class _Question:
 
     id: Number
     slot: Annotated[str, Len(0, 40)] = ""
-    worker: ClassVar[str] = CLICKS
+    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -69,7 +69,6 @@ class LookQuestion(_Question):
     """What lies in a folder of this machine; in the one where the explorer was started if none is named."""
 
     path: Annotated[str, Len(0, 4096)] = ""
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -87,7 +86,6 @@ class OpenQuestion(_Question):
     series: Annotated[str, Len(0, 200)] = ""
     accept: tuple[Annotated[str, Len(1, 40)], ...] = ()
     thick_slices: bool = False
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -96,7 +94,6 @@ class OutlineQuestion(_Question):
 
     point: Point
     take: bool = False
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -119,19 +116,18 @@ class PaintQuestion(_Question):
     normal: Point | None = None
     level_hu: Annotated[float, quantity("difference in HU", at_least=1.0, at_most=2000.0)] = 150.0
     what_if: WhatIf = WhatIf()
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
 class PatientQuestion(_Question):
     """The patient, the systems and their limits."""
 
+    worker: ClassVar[str] = CLICKS
+
 
 @settings
 class SceneQuestion(_Question):
     """Surfaces of all structures and the voxels of the whole lung."""
-
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -139,7 +135,6 @@ class ImageQuestion(_Question):
     """Fine voxels around a point."""
 
     around: Point
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -151,7 +146,6 @@ class SliceQuestion(_Question):
     down: Point
     columns: Pixels
     rows: Pixels
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -159,6 +153,7 @@ class PlaceQuestion(_Question):
     """What is at a point."""
 
     point: Point
+    worker: ClassVar[str] = CLICKS
 
 
 @settings
@@ -166,6 +161,7 @@ class PrepareQuestion(_Question):
     """All that scope and tubes can do: the atlas, and the tips of the scope."""
 
     what_if: WhatIf = WhatIf()
+    worker: ClassVar[str] = CLICKS
 
 
 @settings
@@ -183,6 +179,7 @@ class ExitsQuestion(_Question):
     target: Annotated[str, Len(1, 200)]
     what_if: WhatIf = WhatIf()
     scope_tip: Number | None = None
+    worker: ClassVar[str] = CLICKS
 
 
 @settings
@@ -213,7 +210,6 @@ class AppraiseQuestion(_Question):
     """Check, chance of success, limits and window of a plan, by its digest."""
 
     plan: Annotated[str, Len(1, 128)]
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -224,7 +220,6 @@ class ExplainQuestion(_Question):
     what_if: WhatIf = WhatIf()
     objective: Annotated[str, Len(1, 200)] = "default"
     seed: Number = 0
-    worker: ClassVar[str] = ANSWERS
 
 
 @settings
@@ -233,7 +228,6 @@ class ExportQuestion(_Question):
 
     plan: Annotated[str, Len(1, 128)]
     what: FileKind
-    worker: ClassVar[str] = ANSWERS
 
 
 QUESTIONS: Mapping[str, type[_Question]] = {
@@ -249,9 +243,8 @@ Question = Any
 def read_message(text_of_message: str) -> tuple[str, Question]:
     """Return the name of a question and the question, or CANCEL and the number of the question to end.
 
-    Raises:
-        SettingsError: If the message is too long, no JSON object, of an unknown kind, or a value in it is
-            wrong.
+    Raises SettingsError if the message is too long, no JSON object, of an unknown kind, or a value in it is
+    wrong.
     """
     if len(text_of_message) > MOST_CHARACTERS:
         raise SettingsError("The message is too long", expected=f"at most {MOST_CHARACTERS} characters")

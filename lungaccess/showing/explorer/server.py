@@ -125,11 +125,7 @@ class Explorer:
         return {name: each.pid for name, each in self._processes.items()}
 
     async def start(self) -> Address:
-        """Begin to serve, and return where.
-
-        Raises:
-            SettingsError: If the port is taken.
-        """
+        """Begin to serve, and return where.  Raises SettingsError if the port is taken."""
         self._loop = asyncio.get_running_loop()
         self._loop.set_exception_handler(_without_failed_connections)
         self._processes = self._new_processes()
@@ -167,7 +163,8 @@ class Explorer:
             self._sweep.cancel()
         if self._runner is not None:
             await self._runner.cleanup()
-        await asyncio.to_thread(self._end_processes)
+        for process in self._processes.values():
+            await asyncio.to_thread(process.stop)
         shutil.rmtree(self._folder, ignore_errors=True)
 
     async def _close_half_open(self, runner: web.AppRunner) -> None:
@@ -206,10 +203,6 @@ class Explorer:
         for page in self._pages.values():
             if page is not asking:
                 page.closing = asyncio.create_task(page.socket.close(code=1012, message=b"another patient"))
-
-    def _end_processes(self) -> None:
-        for each in self._processes.values():
-            each.stop()
 
     async def serve(self, started: Callable[[Address], None]) -> None:
         """Serve until SIGINT or SIGTERM comes; `started` is told the address."""

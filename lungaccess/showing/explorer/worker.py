@@ -45,11 +45,7 @@ class PatientSource:
 
     @property
     def patient(self) -> Path:
-        """The folder of the patient.
-
-        Raises:
-            SettingsError: If none is chosen yet.
-        """
+        """The folder of the patient.  Raises SettingsError if none is chosen yet."""
         if self.folder is None:
             raise SettingsError("No patient is open", remedy="Choose a CT or a patient on the page")
         return self.folder
@@ -144,6 +140,10 @@ class Turn:
     def send(self, part: Part) -> None:
         """Send a part at once."""
         self._worker.send(self._asked, part)
+
+    def tell(self, what: str, share: float | None = None) -> None:
+        """Send what is being done, and how much of it is done if that is known."""
+        self.send(Part({"answer": "progress", "what": what, "share": share}))
 
     def check(self) -> None:
         """Raise Superseded if the answer is no longer wanted; may be called by several threads."""

@@ -137,7 +137,6 @@ def _require_same_patient(lung: Lung, ct: CtFile) -> None:
 def _segments(lung: Lung, frame: str) -> tuple[Any, str, list[Any]]:
     """Return the voxels of the structures that a lung has, the type, and the descriptions of the segments."""
     hd = highdicom()
-
     masks = {each.name: _mask(lung, each) for each in SEGMENTS}
     present = [each for each in SEGMENTS if masks[each.name].any()]
     array = np.stack([np.swapaxes(masks[each.name], 0, 2) for each in present], axis=-1)
@@ -185,13 +184,9 @@ def _report(plan: Plan, appraisal: Appraisal, first: Any, uid: Callable[[str], s
     def measured(
         code: str, meaning: str, value: float, unit: str = "mm", graphic: str = "", at: Any = None
     ) -> Any:
-        shown = (
-            [sr.CoordinatesForMeasurement3D(graphic, at, frame_of_reference_uid=frame)] if graphic else None
-        )
+        seen = [sr.CoordinatesForMeasurement3D(graphic, at, frame_of_reference_uid=frame)] if graphic else []
         units = sr.CodedConcept(unit, "UCUM", "percent" if unit == "%" else "millimeter")
-        return sr.Measurement(
-            own(code, meaning), round(value, 4), units, referenced_coordinates=shown or None
-        )
+        return sr.Measurement(own(code, meaning), round(value, 4), units, referenced_coordinates=seen or None)
 
     scope_tip = plan.scope.lps_from_scope_tip[:3, 3]
     found = [

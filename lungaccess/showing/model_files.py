@@ -28,10 +28,8 @@ def export_models(plan: Plan, lung: Lung, folder: str | Path) -> tuple[str, ...]
 
     Each structure and device is an STL in LPS mm.  `plan.glb` holds all of them with their colours in the
     frame of glTF, metres with +y up.  `camera.json` has the eye of the bronchoscope for each picture of a
-    film: `eye` and `target`, 10 mm ahead of it, LPS mm, and the direction `up` of the picture.
-
-    Raises:
-        FileError: If the folder cannot be written.
+    film: `eye` and `target`, 10 mm ahead of it, LPS mm, and the direction `up` of the picture.  Raises
+    FileError if the folder cannot be written.
     """
     import trimesh
 
@@ -65,15 +63,12 @@ def camera_frames(plan: Plan) -> dict[str, object]:
         "field_of_view_deg": math.degrees(2.0 * HALF_ANGLE_RAD),
         "frames": [
             {
-                "time_s": float(time_s),
-                "moves": stage,
-                "eye": eye[:3, 3].tolist(),
-                "target": (eye[:3, 3] + 10.0 * eye[:3, 2]).tolist(),
-                "up": eye[:3, 0].tolist(),
+                "time_s": float(time_s), "moves": stage, "eye": eye[:3, 3].tolist(),
+                "target": (eye[:3, 3] + 10.0 * eye[:3, 2]).tolist(), "up": eye[:3, 0].tolist(),
             }
             for time_s, stage, eye in zip(motion.time_s, motion.stages, eyes, strict=True)
         ],
-    }
+    }  # fmt: skip
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -61,13 +61,12 @@ class _Peer:
 class Link:
     """A server that programs connect to, or a client of one that it connects to again and again.
 
+    Raises SettingsError if pyigtl is missing, the host is no name, or the address cannot be listened at.
+
     Args:
         host: Address to listen at or to connect to.
         port: 0 lets the system choose one to listen at; see `port`.
         connects: Whether it is a client.
-
-    Raises:
-        SettingsError: If pyigtl is missing, the host is no name, or the address cannot be listened at.
     """
 
     def __init__(self, host: str = HOST, port: int = PORT, *, connects: bool = False) -> None:
@@ -115,11 +114,8 @@ class Link:
         dropped = Counter(self._dropped)
         for peer in self._peers.values():
             dropped += peer.decoder.dropped
-        counted = self._counts
-        return LinkCounts(
-            sent=counted["sent"], received=counted["received"], joined=counted["joined"],
-            left=counted["left"], dropped=dict(sorted(dropped.items())),
-        )  # fmt: skip
+        counts = {name: self._counts[name] for name in ("sent", "received", "joined", "left")}
+        return LinkCounts(**counts, dropped=dict(sorted(dropped.items())))
 
     def greet_with(self, messages: tuple[bytes, ...]) -> None:
         """Keep messages that everyone gets who connects from now on."""
@@ -249,17 +245,10 @@ class Link:
             found.extend(peer.decoder.feed(data))
         except (BlockingIOError, InterruptedError):
             return found
-        except FileError:
-            self._dropped[UNREADABLE] += 1
-            self._leave(peer)
-            return found
-        except ConnectionResetError:
-            self._leave(peer)
-            return found
-        except OSError:
-            self._dropped[LOST] += 1
-            self._leave(peer)
-            return found
+        except (FileError, OSError) as error:
+            data = b""
+            if not isinstance(error, ConnectionResetError):
+                self._dropped[UNREADABLE if isinstance(error, FileError) else LOST] += 1
         if not data:
             self._leave(peer)
         return found

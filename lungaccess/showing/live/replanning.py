@@ -15,9 +15,10 @@ from anatomy.base.typed import Float
 from anatomy.base.words import of_hundred
 from anatomy.lung import Lung
 from anatomy.poses import poses_on_pieces
-from lungaccess.planning.one_stage import RestOfPlan, ScopeReplanner, measured_pose, replan_from_tube
+from lungaccess.planning.one_stage import ScopeReplanner, measured_pose, replan_from_tube
 from lungaccess.planning.procedure import WATCHED, Measurements, Policy
 from lungaccess.plans.curves import SHORTEST_MM, STEP_MM, needle_pieces, tube_pieces
+from lungaccess.plans.parts import TubeDeployment
 from lungaccess.plans.plan import Plan
 from lungaccess.problem.system import System
 from lungaccess.problem.target import Target, point_target
@@ -71,12 +72,11 @@ class Answer:
 class TrackedReplanner:
     """Plans the rest of a plan from tracked poses; nothing that a pose can be makes it fail.
 
+    Raises PlanFileError if the plan was made for another patient.
+
     Args:
         policy: What then decides about the tracked poses of scope, tubes and needle, as long as the target is
             where the plan has it; else the cheapest way is taken.
-
-    Raises:
-        PlanFileError: If the plan was made for another patient.
     """
 
     def __init__(self, plan: Plan, lung: Lung, policy: Policy | None = None) -> None:
@@ -113,17 +113,22 @@ class TrackedReplanner:
 
     def _planned(self, name: str, pose: Float) -> tuple[Float | None, Float | None, str]:
         if name == TARGET:
-            self._retarget(pose[:3, 3])
+            self._target = point_target(self._lung, pose[:3, 3], origin="tracked")
+            self._policy = None
+            self.__dict__.pop("_scope_replanner", None)
             return None, None, "target moved"
         if self._policy is not None:
             return self._decided(self._policy, name, pose)
         if name == NEEDLE_TIP:
             return self._from_needle(pose)
-        rest = self._from_scope(pose) if name == SCOPE_TIP else self._from_tube(pose)
-        tubes = None
-        if rest.tube is not None:
-            pieces = tube_pieces(rest.tube)
-            tubes = poses_on_pieces(rest.lps_from_measured, pieces, PATH_STEP_MM)[0][:, :3, 3]
+        if name == SCOPE_TIP:
+            rest = self._scope_replanner.replan(measured_pose(self._lung, pose, "scope"))
+        else:
+            rest = replan_from_tube(
+                self._lung, self._device, pose, self._target, objective=self._plan.objective,
+                seed=self._plan.seed, iterations=ITERATIONS,
+            )  # fmt: skip
+        tubes = _tube_points(rest.tube, rest.lps_from_measured)
         needle = rest.path.sample(PATH_STEP_MM)[0] if rest.needle is not None else None
         return tubes, needle, f"plan: cost {rest.cost:.4g}, needle {rest.path.length_mm:.1f} mm"
 
@@ -148,21 +153,12 @@ class TrackedReplanner:
         words = f"{decision.action}: {of_hundred(decision.chance)} of 100"
         if not decision.goes_on:
             return None, None, words
-        out = None
-        if decision.tube is not None:
-            pieces = tube_pieces(decision.tube)
-            out = poses_on_pieces(decision.lps_from_device, pieces, PATH_STEP_MM)[0][:, :3, 3]
+        out = _tube_points(decision.tube, decision.lps_from_device)
         if decision.needle is None:
             return out, None, words
         start = np.asarray(decision.needle.lps_from_start)
         path = ArcPath(lps_from_start=start, arcs=needle_pieces(decision.needle))
         return out, path.sample(PATH_STEP_MM)[0], words
-
-    def _retarget(self, place: Float) -> None:
-        """Take another target from now on; TargetError if a needle may not end there."""
-        self._target = point_target(self._lung, place, origin="tracked")
-        self._policy = None
-        self.__dict__.pop("_scope_replanner", None)
 
     @property
     def _device(self) -> System:
@@ -179,15 +175,6 @@ class TrackedReplanner:
         # Where no direct arc is clear, the needle's own search starts from ten deployments: ten milliseconds.
         return ScopeReplanner(task, tries=0, searches=10)
 
-    def _from_scope(self, pose: Float) -> RestOfPlan:
-        return self._scope_replanner.replan(measured_pose(self._lung, pose, "scope"))
-
-    def _from_tube(self, pose: Float) -> RestOfPlan:
-        return replan_from_tube(
-            self._lung, self._device, pose, self._target, objective=self._plan.objective,
-            seed=self._plan.seed, iterations=ITERATIONS,
-        )  # fmt: skip
-
     @cached_property
     def _needle_replanner(self) -> Replanner:
         plan, system = self._plan, self._plan.system
@@ -197,8 +184,7 @@ class TrackedReplanner:
         )
         start = np.asarray(plan.tube.lps_from_tip)
         query = Query(lps_from_start=start, target=self.target_lps, branch=plan.exemption.branch)
-        path = ArcPath(lps_from_start=start, arcs=needle_pieces(plan.needle))
-        objective = Objective.of(plan.objective)
+        path, objective = self._first_path, Objective.of(plan.objective)
         self._most_per_mm = needle.max_curvature_per_mm
         self._follow(query, path, 0.0)
         return Replanner(environment, query, path, objective=objective, iterations=ITERATIONS, seed=plan.seed)
@@ -241,3 +227,10 @@ class TrackedReplanner:
     def _first_path(self) -> ArcPath:
         start = np.asarray(self._plan.tube.lps_from_tip)
         return ArcPath(lps_from_start=start, arcs=needle_pieces(self._plan.needle))
+
+
+def _tube_points(tube: TubeDeployment | None, lps_from_scope_tip: Float) -> Float | None:
+    """Return points of the tubes for a path that is sent, LPS mm; None where they are not left to do."""
+    if tube is None:
+        return None
+    return poses_on_pieces(lps_from_scope_tip, tube_pieces(tube), PATH_STEP_MM)[0][:, :3, 3]

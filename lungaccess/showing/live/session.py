@@ -85,7 +85,6 @@ class LiveSession:
         self._replanner = TrackedReplanner(plan, lung, policy)
         self._trajectory: Trajectory = plan_trajectory(plan, speeds)
         self._moving = None if lung.motion is None else Moving.of(plan, lung)
-        self._masks_phase = None if lung.motion is None else lung.motion.masks_phase
         self._plan, self._link, self._rate_hz, self._loop = plan, link, rate_hz, loop
         self._on_answer = on_answer or (lambda _answer: None)
         self._wall_clock = wall_clock
@@ -100,36 +99,30 @@ class LiveSession:
         """What has been done so far."""
         taken = 1e3 * np.array(self._replan_s or [0.0])
         return LiveCounts(
-            ticks=self._counts["ticks"], overrun=self._counts["overrun"], replans=len(self._replan_s),
-            found=self._counts["found"], superseded=self._counts["superseded"],
-            unknown=self._counts["unknown"], replan_median_ms=float(np.median(taken)),
+            **{name: self._counts[name] for name in ("ticks", "overrun", "found", "superseded", "unknown")},
+            replans=len(self._replan_s), replan_median_ms=float(np.median(taken)),
             replan_most_ms=float(taken.max()), link=self._link.counts,
         )  # fmt: skip
 
     def run(self, seconds: float | None = None) -> None:
         """Go round until so many seconds have passed, or for ever."""
         self._replanner.warm_up()
-        began = time.monotonic()
-        due = began
+        began = due = time.monotonic()
         while seconds is None or time.monotonic() - began < seconds:
             self.tick(time.monotonic() - began)
             due += 1.0 / self._rate_hz
-            late = time.monotonic() - due
-            if late > 0.0:
+            if time.monotonic() > due:
                 self._counts["overrun"] += 1
                 due = time.monotonic()
-            self._wait(due)
+            # What comes until the next round is due is answered meanwhile.
+            while (left := due - time.monotonic()) > 0.0:
+                self._take(self._link.poll(left))
 
     def tick(self, elapsed_s: float) -> None:
         """Do one round: answer what has come, and send where everything is after so many seconds."""
         self._counts["ticks"] += 1
         self._take(self._link.poll())
         self._link.send(*self._state(elapsed_s))
-
-    def _wait(self, due: float) -> None:
-        """Wait until a round is due, and answer what comes meanwhile."""
-        while (left := due - time.monotonic()) > 0.0:
-            self._take(self._link.poll(left))
 
     def _take(self, received: list[Received]) -> None:
         """Answer the newest of each tracked pose."""

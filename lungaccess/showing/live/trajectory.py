@@ -91,15 +91,13 @@ class Trajectory:
 def plan_trajectory(plan: Plan, speeds: Speeds | None = None, *, step_s: float = STEP_S) -> Trajectory:
     """Return a plan as a motion in time, each joint at its speed or slower.
 
-    The scope goes through its states.  The tubes are turned at the tip of the scope, then go out together
-    and stop one by one, as the plan's sweep is proved for.  The needle rolls, then bends along each arc.
+    The scope goes through its states.  The tubes are turned at the tip of the scope, then go out together and
+    stop one by one, as the plan's sweep is proved for.  The needle rolls, then bends along each arc.  Raises
+    SettingsError if the step is not above 0, or the tubes of the plan snap on the way.
 
     Args:
         speeds: The default ones if None.
         step_s: Largest time between two samples; there is one at every state, stop and arc, too.
-
-    Raises:
-        SettingsError: If the step is not above 0, or the tubes of the plan snap on the way.
     """
     if not 0.0 < step_s < np.inf:
         raise SettingsError(f"The samples are {step_s} s apart", expected="a time above 0")
@@ -233,8 +231,7 @@ _SI = {"_mm": ("", M_PER_MM), "_rad": ("", 1.0), "_per_mm": ("", 1.0 / M_PER_MM)
 def write_trajectory(trajectory: Trajectory, folder: str | Path) -> tuple[str, ...]:
     """Write a trajectory as a table and as messages of ROS 2; return the names of the files.
 
-    Raises:
-        FileError: If the folder cannot be written.
+    Raises FileError if the folder cannot be written.
     """
     target = require_writable_folder(folder)
     write_text(target / TABLE_FILE, table_text(trajectory))
@@ -274,14 +271,11 @@ def joint_trajectory(trajectory: Trajectory) -> dict[str, Any]:
     rates[:, -1] = 0.0
     points = [
         {
-            "positions": position.tolist(),
-            "velocities": rate.tolist(),
-            "accelerations": [],
-            "effort": [],
+            "positions": position.tolist(), "velocities": rate.tolist(), "accelerations": [], "effort": [],
             "time_from_start": _time(time),
         }
         for position, rate, time in zip(values, rates, trajectory.time_s.tolist(), strict=True)
-    ]
+    ]  # fmt: skip
     names = [name.removesuffix(_unit(name)) for name in trajectory.joints]
     return {"header": _header(0.0), "joint_names": names, "points": points}
 

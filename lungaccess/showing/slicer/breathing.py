@@ -63,8 +63,7 @@ RIGID = ("tubes", "needle", "aim")
 def write_breathing(plan: Plan, lung: Lung, items: Sequence[Item], folder: Path) -> tuple[str, ...]:
     """Write a scene of items that breathe, beside their files; return the names of what was written.
 
-    Raises:
-        FileError: If the folder cannot be written.
+    Raises FileError if the folder cannot be written.
     """
     moving = Moving.of(plan, lung)
     masks = moving.tissue.masks_phase
@@ -74,10 +73,8 @@ def write_breathing(plan: Plan, lung: Lung, items: Sequence[Item], folder: Path)
     said = "window not computed" if plan.window is None else plan.window.words.partition(" (")[0]
     lines = _sequences(phases, int(np.flatnonzero(phases == masks)[0]), said)
     # The start region holds in the phase of the masks alone, and does not move.
-    moved = {
-        item.file: item.file.split(".")[0] for item in items if not item.file.startswith("start_region_")
-    }
-    movers = {file: (DEVICES if stem in RIGID else TISSUE).proxy for file, stem in moved.items()}
+    moved = [item.file for item in items if not item.file.startswith("start_region_")]
+    movers = {file: (DEVICES if file.split(".")[0] in RIGID else TISSUE).proxy for file in moved}
     write_text(folder / SCENE_FILE, scene(items, movers, lines))
     return (SCENE_FILE, *(mover.bundle for mover in MOVERS))
 
@@ -94,16 +91,8 @@ def _affine(lps_from_masks: Float) -> str:
     """Return a rigid motion as a transform file of ITK, LPS mm: the way back to the masks."""
     back = np.linalg.inv(lps_from_masks)
     numbers = " ".join(f"{value:.12g}" for value in [*back[:3, :3].ravel(), *back[:3, 3]])
-    return "\n".join(
-        (
-            "#Insight Transform File V1.0",
-            "#Transform 0",
-            "Transform: AffineTransform_double_3_3",
-            f"Parameters: {numbers}",
-            "FixedParameters: 0 0 0",
-            "",
-        )
-    )
+    head = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    return f"{head}Parameters: {numbers}\nFixedParameters: 0 0 0\n"
 
 
 def _write_bundle(folder: Path, mover: Mover, phases: Float, write: Callable[[float, Path], None]) -> None:
@@ -134,12 +123,9 @@ def _index(mover: Mover, phases: Float) -> dict[str, str]:
     """Return what says which transform belongs to which phase."""
     values = (f"vtkMRML{mover.kind}Node{n}:{100.0 * phase:g}" for n, phase in enumerate(phases, start=1))
     return {
-        "indexName": "phase",
-        "indexUnit": "%",
-        "indexType": "numeric",
-        "numericIndexValueTolerance": "0.001",
+        "indexName": "phase", "indexUnit": "%", "indexType": "numeric", "numericIndexValueTolerance": "0.001",
         "indexValues": ";".join(values),
-    }
+    }  # fmt: skip
 
 
 def _sequences(phases: Float, selected: int, said: str) -> list[str]:
@@ -157,16 +143,11 @@ def _sequences(phases: Float, selected: int, said: str) -> list[str]:
         references += f"sequenceNodeRef{n}:{sequence};dataNodeRef{n}:{mover.proxy};"
     together = "playback true recording false overwriteProxyName false saveChanges false"
     browser = {
-        "id": "vtkMRMLSequenceBrowserNode1",
-        "name": f"Breathing: {said}",
-        "references": references,
-        "playbackActive": "false",
-        "playbackRateFps": f"{FRAMES_PER_S}",
-        "playbackItemSkippingEnabled": "true",
-        "playbackLooped": "true",
-        "selectedItemNumber": f"{selected}",
+        "id": "vtkMRMLSequenceBrowserNode1", "name": f"Breathing: {said}", "references": references,
+        "playbackActive": "false", "playbackRateFps": f"{FRAMES_PER_S}",
+        "playbackItemSkippingEnabled": "true", "playbackLooped": "true", "selectedItemNumber": f"{selected}",
         "recordingActive": "false",
         "virtualNodePostfixes": " ".join(str(n) for n in range(1, len(MOVERS) + 1)),
         **{f"SynchronizationPropertiesMap{n}": together for n in range(1, len(MOVERS) + 1)},
-    }
+    }  # fmt: skip
     return [*lines, element("SequenceBrowser", browser)]

@@ -108,10 +108,8 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
 def path_of_points(points_lps: Float, lps_from_start: Float) -> ArcPath:
     """Return the arcs through points `(N, 3)`, one from each to the next, in the direction of a start pose.
 
-    Arcs that continue one another are joined.
-
-    Raises:
-        SettingsError: If fewer than two points are apart from each other.
+    Arcs that continue one another are joined.  Raises SettingsError if fewer than two points are apart from
+    each other.
     """
     frame = np.array(lps_from_start)
     frame[:3, 3] = points_lps[0]
@@ -255,15 +253,9 @@ def _with_needle(plan: Plan, lung: Lung, path: ArcPath) -> tuple[Plan, tuple[Fin
         task=task, lps_from_measured=plan.tube.lps_from_tip, deployment=None, path=path, branch=branch
     )
     made = replace(
-        plan,
-        needle=rest.needle,
-        clearance_mm={**plan.clearance_mm, **rest.clearance_mm},
-        costs=rest.costs,
-        method=EDITED,
-        chance=None,
-        window=None,
-        cost_bound=0.0,
-    )
+        plan, needle=rest.needle, clearance_mm={**plan.clearance_mm, **rest.clearance_mm}, costs=rest.costs,
+        method=EDITED, chance=None, window=None, cost_bound=0.0,
+    )  # fmt: skip
     environment = needle_environment(lung, needle, system.margins, with_fissures=task.with_fissures)
     query = Query(lps_from_start=np.asarray(plan.tube.lps_from_tip), target=plan.end_lps, branch=branch)
     broken = violation(environment, query, path, goal_tolerance_mm=MOVED_MM)

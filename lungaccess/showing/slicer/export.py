@@ -17,17 +17,8 @@ from anatomy.lung import Lung
 from lungaccess.judging.checking import CheckReport, check
 from lungaccess.plans.curves import DeviceCurve, DeviceCurves
 from lungaccess.plans.plan import Plan
+from lungaccess.showing.slicer import models
 from lungaccess.showing.slicer.breathing import write_breathing
-from lungaccess.showing.slicer.models import (
-    TARGET_COLOUR,
-    aim_point,
-    curve_markup,
-    device_surface,
-    points_of_interest,
-    structure_surface,
-    write_ply,
-    write_segmentation,
-)
 from lungaccess.showing.slicer.scene import Item, scene
 from lungaccess.uncertainty.risk import proved_body, safe_start_region, tried_body
 
@@ -39,7 +30,7 @@ STRUCTURES: dict[str, tuple[tuple[float, float, float], float]] = {
     "airway": ((0.62, 0.85, 0.90), 0.35),
     "vessel": ((0.84, 0.15, 0.16), 0.6),
     "fissure": ((0.58, 0.40, 0.74), 0.3),
-    "nodule": (TARGET_COLOUR, 0.8),
+    "nodule": (models.TARGET_COLOUR, 0.8),
 }
 """Models of the anatomy: colour and opacity."""
 
@@ -114,17 +105,19 @@ def _write_devices(plan: Plan, folder: Path, *, refused: bool) -> list[Item]:
     items = []
     for curve in plan.shown_curves(STEP_MM):
         curve_file, model_file = f"{curve.name}.mrk.json", f"{curve.name}.ply"
-        _write_json(folder / curve_file, _named(curve_markup(curve), prefix))
-        write_ply(folder / model_file, device_surface(curve))
+        _write_json(folder / curve_file, _named(models.curve_markup(curve), prefix))
+        models.write_ply(folder / model_file, models.device_surface(curve))
         name = f"{prefix}{curve.name}"
         items.append(Item(kind="MarkupsCurve", name=name, file=curve_file, colour=curve.colour))
         items.append(Item(kind="Model", name=f"{name} surface", file=model_file, colour=curve.colour))
-    fiducials = {"points": (POINTS_FILE, points_of_interest(plan))}
+    fiducials = {"points": (POINTS_FILE, models.points_of_interest(plan))}
     if plan.aim is not None:
-        fiducials["aim"] = ("aim.mrk.json", aim_point(plan.aim))
+        fiducials["aim"] = ("aim.mrk.json", models.aim_point(plan.aim))
     for name, (file, content) in fiducials.items():
         _write_json(folder / file, _named(content, prefix))
-        items.append(Item(kind="MarkupsFiducial", name=f"{prefix}{name}", file=file, colour=TARGET_COLOUR))
+        items.append(
+            Item(kind="MarkupsFiducial", name=f"{prefix}{name}", file=file, colour=models.TARGET_COLOUR)
+        )
     return items
 
 
@@ -140,7 +133,7 @@ def _write_start_region(plan: Plan, lung: Lung, folder: Path) -> tuple[list[Item
         ("start_region_tried", tried_body(region), TRIED_COLOUR),
     ):
         if body is not None:
-            write_ply(folder / f"{name}.ply", body)
+            models.write_ply(folder / f"{name}.ply", body)
             items.append(
                 Item(
                     kind="Model", name=name.replace("_", " "), file=f"{name}.ply", colour=colour, opacity=0.4
@@ -159,13 +152,13 @@ def _write_anatomy(lung: Lung, folder: Path, tell: Progress) -> list[Item]:
     items = [Item(kind="Model", name="airway tree", file=TREE_FILE, colour=(0.0, 0.2, 0.6), visible=False)]
     for done, (name, (colour, opacity)) in enumerate(STRUCTURES.items(), start=1):
         tell(f"surface of {name}", done / (len(STRUCTURES) + 2))
-        mesh = structure_surface(lung, name)
+        mesh = models.structure_surface(lung, name)
         if mesh is None:
             continue
-        write_ply(folder / f"{name}.ply", mesh)
+        models.write_ply(folder / f"{name}.ply", mesh)
         items.append(Item(kind="Model", name=name, file=f"{name}.ply", colour=colour, opacity=opacity))
     tell("segmentation", (len(STRUCTURES) + 1) / (len(STRUCTURES) + 2))
-    write_segmentation(folder / SEGMENTATION_FILE, lung)
+    models.write_segmentation(folder / SEGMENTATION_FILE, lung)
     return [*items, Item(kind="Segmentation", name="anatomy", file=SEGMENTATION_FILE, opacity=0.5)]
 
 

@@ -31,6 +31,7 @@ _ALTERED = "SCT^49755003^Morphologically Altered Structure"
 
 TARGET_COLOUR = (0.17, 0.63, 0.17)
 
+Plain = dict[str, Any]
 SIDES = 16
 """Corners of a ring around a device."""
 
@@ -96,14 +97,15 @@ def device_surface(curve: DeviceCurve) -> SurfaceMesh:
     first, last = count * SIDES, count * SIDES + 1
     here = np.arange(SIDES)
     after = (here + 1) % SIDES
-    faces = []
-    for n in range(count - 1):
-        low, high = n * SIDES, (n + 1) * SIDES
-        faces.append(np.stack([low + here, low + after, high + after], axis=1))
-        faces.append(np.stack([low + here, high + after, high + here], axis=1))
-    top = (count - 1) * SIDES
-    faces.append(np.stack([np.full(SIDES, first), after, here], axis=1))
-    faces.append(np.stack([np.full(SIDES, last), top + here, top + after], axis=1))
+    low, top = SIDES * np.arange(count - 1)[:, None], (count - 1) * SIDES
+    high = low + SIDES
+    sides = [[low + here, low + after, high + after], [low + here, high + after, high + here]]
+    caps = [[np.full(SIDES, first), after, here], [np.full(SIDES, last), top + here, top + after]]
+    # Two rows of triangles between each ring and the next.
+    faces = [
+        np.moveaxis(np.array(sides), (0, 1), (1, 3)).reshape(-1, 3),
+        np.swapaxes(np.array(caps), 1, 2).reshape(-1, 3),
+    ]
     return SurfaceMesh(
         vertices_lps=np.concatenate([rings.reshape(-1, 3), ends]),
         faces=np.concatenate(faces),
@@ -134,36 +136,23 @@ def _untwisted(lps_from_device: Float) -> Float:
 def write_ply(path: str | Path, mesh: SurfaceMesh) -> None:
     """Write a mesh as binary `.ply` in LPS mm with the comment `SPACE=LPS`, which 3D Slicer reads.
 
-    Raises:
-        FileError: If the name does not end in .ply, or the file cannot be written.
+    Raises FileError if the name does not end in .ply, or the file cannot be written.
     """
     require_suffix(path, ".ply")
-    header = "\n".join(
-        (
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment lungaccess, millimetres",
-            "comment SPACE=LPS",
-            f"element vertex {len(mesh.vertices_lps)}",
-            "property float x",
-            "property float y",
-            "property float z",
-            f"element face {len(mesh.faces)}",
-            "property list uchar int vertex_indices",
-            "end_header",
-            "",
-        )
-    )
+    lines = (
+        "ply", "format binary_little_endian 1.0", "comment lungaccess, millimetres", "comment SPACE=LPS",
+        f"element vertex {len(mesh.vertices_lps)}", *(f"property float {axis}" for axis in "xyz"),
+        f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header", "",
+    )  # fmt: skip
     faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", (3,))])
     faces["count"] = 3
     faces["corners"] = mesh.faces
     with atomic_write(path) as temporary:
-        temporary.write_bytes(
-            header.encode("ascii") + mesh.vertices_lps.astype("<f4").tobytes() + faces.tobytes()
-        )
+        vertices = mesh.vertices_lps.astype("<f4").tobytes()
+        temporary.write_bytes("\n".join(lines).encode("ascii") + vertices + faces.tobytes())
 
 
-def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
+def curve_markup(curve: DeviceCurve) -> Plain:
     """Return the content of a `.mrk.json` file: an open curve in LPS mm.
 
     `orientation` holds the pose of the device at each point, row by row: its columns are the x, y and z
@@ -176,16 +165,13 @@ def curve_markup(curve: DeviceCurve) -> dict[str, Any]:
         )
     ]
     radius = {
-        "name": "Radius",
-        "enabled": True,
-        "units": "mm",
-        "description": "outer radius of the device",
+        "name": "Radius", "enabled": True, "units": "mm", "description": "outer radius of the device",
         "controlPointValues": curve.radius_mm.tolist(),
-    }
-    return _file("Curve", curve.name, points, curve.colour, labels=False, measurements=[radius])
+    }  # fmt: skip
+    return _file("Curve", curve.name, points, curve.colour, [radius])
 
 
-def points_of_interest(plan: Plan) -> dict[str, Any]:
+def points_of_interest(plan: Plan) -> Plain:
     """Return the content of a `.mrk.json` file: scope tip, tip of the tubes, exit and target, LPS mm.
 
     The tips keep the pose of their device, also where they are moved in 3D Slicer.
@@ -199,66 +185,47 @@ def points_of_interest(plan: Plan) -> dict[str, Any]:
     return _fiducials("points", places, tips)
 
 
-def aim_point(aim: BreathingAim) -> dict[str, Any]:
+def aim_point(aim: BreathingAim) -> Plain:
     """Return the content of a `.mrk.json` file: where devices end beside the target, LPS mm."""
     return _fiducials("aim", {"aim of the devices": aim.point_lps})
 
 
 def _fiducials(
     name: str, places: Mapping[str, Float], poses: Mapping[str, Float] = MappingProxyType({})
-) -> dict[str, Any]:
+) -> Plain:
     points = [
         _point(number, label, place) | (_orientation(poses[label]) if label in poses else {})
         for number, (label, place) in enumerate(places.items(), start=1)
     ]
-    return _file("Fiducial", name, points, TARGET_COLOUR, labels=True, measurements=[])
+    return _file("Fiducial", name, points, TARGET_COLOUR, [])
 
 
 def _orientation(pose: Float) -> dict[str, list[float]]:
     return {"orientation": pose[:3, :3].ravel().tolist()}
 
 
-def _point(number: int, label: str, place: Float) -> dict[str, Any]:
+def _point(number: int, label: str, place: Float) -> Plain:
     return {
-        "id": f"{number}",
-        "label": label,
-        "position": place.tolist(),
-        "locked": False,
-        "visibility": True,
+        "id": f"{number}", "label": label, "position": place.tolist(), "locked": False, "visibility": True,
         "positionStatus": "defined",
-    }
+    }  # fmt: skip
 
 
 def _file(
-    kind: str,
-    name: str,
-    points: list[dict[str, Any]],
-    colour: tuple[float, float, float],
-    *,
-    labels: bool,
-    measurements: list[dict[str, Any]],
-) -> dict[str, Any]:
+    kind: str, name: str, points: list[Plain], colour: tuple[float, float, float], measurements: list[Plain]
+) -> Plain:
+    """Return the content of a file of markups; points alone show their labels."""
+    labels = kind == "Fiducial"
     display = {
-        "visibility": True,
-        "opacity": 1.0,
-        "color": list(colour),
-        "selectedColor": list(colour),
-        "propertiesLabelVisibility": not labels,
-        "pointLabelsVisibility": labels,
-        "glyphType": "Sphere3D",
+        "visibility": True, "opacity": 1.0, "color": list(colour), "selectedColor": list(colour),
+        "propertiesLabelVisibility": not labels, "pointLabelsVisibility": labels, "glyphType": "Sphere3D",
         "glyphScale": 2.0 if labels else 0.5,
-    }
+    }  # fmt: skip
     markup = {
-        "type": kind,
-        "name": name,
-        "coordinateSystem": "LPS",
-        "coordinateUnits": "mm",
-        "locked": True,
-        "fixedNumberOfControlPoints": True,
-        "controlPoints": points,
-        "measurements": measurements,
+        "type": kind, "name": name, "coordinateSystem": "LPS", "coordinateUnits": "mm", "locked": True,
+        "fixedNumberOfControlPoints": True, "controlPoints": points, "measurements": measurements,
         "display": display,
-    }
+    }  # fmt: skip
     return {"@schema": MARKUPS_SCHEMA, "markups": [markup]}
 
 
@@ -315,8 +282,7 @@ def label_map(lung: Lung) -> Volume:
 def write_segmentation(path: str | Path, lung: Lung) -> tuple[Segment, ...]:
     """Write the label map of a lung, and return the segments that are not empty.
 
-    Raises:
-        FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     volume = label_map(lung)
     present = tuple(each for each in SEGMENTS if (volume.array == each.value).any())
@@ -335,14 +301,11 @@ def _header(labels: UInt8, segments: tuple[Segment, ...]) -> Mapping[str, str]:
         low, high = bounds(labels == segment.value)
         where = np.stack([low, high - 1], axis=1).ravel().tolist()
         header |= {
-            f"Segment{number}_ID": f"Segment_{segment.value}",
-            f"Segment{number}_Name": segment.name,
+            f"Segment{number}_ID": f"Segment_{segment.value}", f"Segment{number}_Name": segment.name,
             f"Segment{number}_NameAutoGenerated": "0",
             f"Segment{number}_Color": " ".join(f"{c:g}" for c in segment.colour),
-            f"Segment{number}_ColorAutoGenerated": "0",
-            f"Segment{number}_LabelValue": f"{segment.value}",
-            f"Segment{number}_Layer": "0",
-            f"Segment{number}_Extent": " ".join(str(n) for n in where),
+            f"Segment{number}_ColorAutoGenerated": "0", f"Segment{number}_LabelValue": f"{segment.value}",
+            f"Segment{number}_Layer": "0", f"Segment{number}_Extent": " ".join(str(n) for n in where),
             f"Segment{number}_Tags": f"TerminologyEntry:{segment.terminology}|",
-        }
+        }  # fmt: skip
     return header

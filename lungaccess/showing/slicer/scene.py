@@ -9,17 +9,11 @@ from anatomy.base.records import frozen_value
 
 Kind = Literal["Model", "MarkupsCurve", "MarkupsFiducial", "Segmentation"]
 
-_DISPLAY: dict[Kind, str] = {
-    "Model": "ModelDisplay",
-    "MarkupsCurve": "MarkupsDisplay",
-    "MarkupsFiducial": "MarkupsFiducialDisplay",
-    "Segmentation": "SegmentationDisplay",
-}
-_STORAGE: dict[Kind, str] = {
-    "Model": "ModelStorage",
-    "MarkupsCurve": "MarkupsJsonStorage",
-    "MarkupsFiducial": "MarkupsJsonStorage",
-    "Segmentation": "SegmentationStorage",
+_SHOWN_AND_STORED: dict[Kind, tuple[str, str]] = {
+    "Model": ("ModelDisplay", "ModelStorage"),
+    "MarkupsCurve": ("MarkupsDisplay", "MarkupsJsonStorage"),
+    "MarkupsFiducial": ("MarkupsFiducialDisplay", "MarkupsJsonStorage"),
+    "Segmentation": ("SegmentationDisplay", "SegmentationStorage"),
 }
 
 
@@ -49,7 +43,8 @@ def scene(
     """
     lines = ['<MRML version="Slicer5" userTags="">', *more]
     for number, item in enumerate(items, start=1):
-        display, storage = (f"vtkMRML{tags[item.kind]}Node{number}" for tags in (_DISPLAY, _STORAGE))
+        tags = _SHOWN_AND_STORED[item.kind]
+        display, storage = (f"vtkMRML{tag}Node{number}" for tag in tags)
         moved = f"transform:{transforms[item.file]};" if item.file in transforms else ""
         node = {
             "id": f"vtkMRML{item.kind}Node{number}",
@@ -60,8 +55,8 @@ def scene(
         place = {"name": f"{item.name} storage", "fileName": item.file}
         place |= {} if item.kind == "Segmentation" else {"coordinateSystem": "LPS"}
         lines += [
-            element(_DISPLAY[item.kind], {"id": display, **_look(item)}),
-            element(_STORAGE[item.kind], {"id": storage, **place}),
+            element(tags[0], {"id": display, **_look(item)}),
+            element(tags[1], {"id": storage, **place}),
             element(item.kind, node),
         ]
     return "\n".join([*lines, "</MRML>", ""])

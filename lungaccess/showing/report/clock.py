@@ -45,8 +45,7 @@ def on_rim(phase: float, *, exhaling: bool = False, radius: float = 1.0) -> tupl
 def window_png(window: BreathingWindow, path: str | os.PathLike[str]) -> Path:
     """Draw the window of a plan on the clock of a breath, with what ends it.
 
-    Raises:
-        FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     from lungaccess.showing.report import style
 

@@ -25,13 +25,8 @@ MISS, NEAREST, OTHER = "#8E24AA", "#2F8FD0", "#009E73"
 
 START_COLOURS = MappingProxyType(
     {
-        "clear": "#009E73",
-        "a vessel": "#D81B60",
-        "a fissure": "#785EF0",
-        "an airway": "#1E88E5",
-        "the pleura": "#B8860B",
-        "needs several arcs": "#E69F00",
-        "out of reach": "#B0B0B0",
+        "clear": "#009E73", "a vessel": "#D81B60", "a fissure": "#785EF0", "an airway": "#1E88E5",
+        "the pleura": "#B8860B", "needs several arcs": "#E69F00", "out of reach": "#B0B0B0",
     }
-)
+)  # fmt: skip
 """The colours by the keys of `FAILS`; those of structures are theirs in the charts of a page."""

@@ -229,13 +229,6 @@ def target_mark(axes: Axes, uv: Float, order: int = 12) -> None:
 def aim_mark(axes: Axes, uv: Float) -> None:
     """Mark where devices end that were planned for a moving target."""
     axes.plot(
-        uv[0],
-        uv[1],
-        marker="x",
-        ms=7,
-        mec=style.AIM,
-        mew=2.0,
-        zorder=13,
-        path_effects=halo(4.0, style.INK),
+        uv[0], uv[1], marker="x", ms=7, mec=style.AIM, mew=2.0, zorder=13, path_effects=halo(4.0, style.INK),
         ls="none",
-    )
+    )  # fmt: skip

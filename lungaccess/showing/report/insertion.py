@@ -9,7 +9,7 @@ import numpy as np
 from anatomy.base.files import atomic_write
 from anatomy.base.typed import Float
 from anatomy.lung import Lung
-from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy
+from lungaccess.planning.procedure.insertion import Insertion, InsertionStudy, Summary
 from lungaccess.showing.report import style
 from stages.needle import Query
 
@@ -48,16 +48,18 @@ class Plane:
         axes.set(xlabel="towards the target, mm", ylabel="aside, mm", ylim=(-ASIDE_MM, ASIDE_MM))
 
 
+def modes(found: InsertionStudy) -> dict[str, tuple[str, Summary]]:
+    """Return the colour and the insertions of both ways to insert, by the name of the way."""
+    return {"open loop": (OPEN, found.open_loop), "closed loop": (CLOSED, found.closed_loop)}
+
+
 def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
     """Draw true paths in the plane of the plan, with what the plane cuts in grey."""
     from lungaccess.planning.procedure.insertion import Outcome
 
     plane = Plane(found.query)
     plane.show_obstacles(axes, lung)
-    for colour, mode, name in (
-        (OPEN, found.open_loop, "open loop"),
-        (CLOSED, found.closed_loop, "closed loop"),
-    ):
+    for name, (colour, mode) in modes(found).items():
         for n, run in enumerate(mode.insertions):
             points, goal = plane.flat(run.lps_from_tip[:, :3, 3]), plane.flat(run.target_lps)
             axes.plot(*points.T, color=colour, lw=0.8, alpha=0.7, label=None if n else name)
@@ -73,17 +75,13 @@ def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
 def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Draw the true paths of all needles, and how many of them end how near to the target.
 
-    Raises:
-        FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     figure = style.new_figure(13.0, 5.2)
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.5, 1.0]})
     draw_paths(left, lung, found)
     left.set_title("True paths; grey: what the plane of the plan cuts", fontsize=10)
-    for colour, mode, name in (
-        (OPEN, found.open_loop, "open loop"),
-        (CLOSED, found.closed_loop, "closed loop"),
-    ):
+    for name, (colour, mode) in modes(found).items():
         errors = np.sort(mode.tip_errors_mm)
         share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
         right.step(errors, share, where="post", color=colour, label=name)
@@ -104,10 +102,7 @@ def insertion_webp(
     """Write a film of the first needle, blindly and with the tracker side by side in time.
 
     Shown are the true paths so far, the plan, the path that was planned last from where the tracker has the
-    tip, and where the target is in the end.
-
-    Raises:
-        FileError: If the file cannot be written.
+    tip, and where the target is in the end.  Raises FileError if the file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image

@@ -32,10 +32,8 @@ def needle_png(answer: NeedleAnswer, lung: Organ, path: str | os.PathLike[str]) 
 
     Both panels are cuts.  The left one follows the path; without one it holds start, direction of insertion
     and target.  Dashed are the tightest arcs of the needle, between which it reaches.  The right one shows
-    what is blocked, else the start, with the needle's radius and the distance that it has to keep.
-
-    Raises:
-        FileError: If the file cannot be written.
+    what is blocked, else the start, with the needle's radius and the distance that it has to keep.  Raises
+    FileError if the file cannot be written.
     """
     from lungaccess.planning.one_stage import reason_in_words
 
@@ -74,7 +72,6 @@ def _whole_panel(
     start = query.lps_from_start[:3, 3]
     shown = view.project(np.concatenate([points, [start, query.target]]))
     drawing.fit(axes, shown.min(axis=0) - 7.0, shown.max(axis=0) + 7.0)
-    limits = axes.get_xlim(), axes.get_ylim()
     paint_cut(axes, layers, view, points)
     far = 1.15 * float(np.linalg.norm(query.target - start))
     for arc in _tightest_arcs(query, view, 1.0 / answer.environment.limits.kappa, far):
@@ -88,8 +85,6 @@ def _whole_panel(
             uv[0], uv[1], marker="X", ms=10, mfc=BLOCKED, mec="white", mew=1.2, zorder=15, ls="none",
             path_effects=drawing.halo(2.5),
         )  # fmt: skip
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
     drawing.dress(axes, view, ticks=False)
     drawing.title(
         axes,
@@ -104,7 +99,6 @@ def _close_panel(
     """Draw the needle and what it has to keep near one place."""
     uv = view.project(middle)
     drawing.fit(axes, uv - CLOSE_MM, uv + CLOSE_MM)
-    limits = axes.get_xlim(), axes.get_ylim()
     paint_cut(axes, layers, view, middle)
     _needle(axes, answer, query, view, points)
     found = answer.obstruction
@@ -116,8 +110,6 @@ def _close_panel(
             axes.plot(ends[:, 0], ends[:, 1], color=BLOCKED, lw=2.0, marker="o", ms=4, zorder=15)
         radius = answer.environment.needle.radius_mm
         axes.add_patch(Circle((uv[0], uv[1]), radius, fc=BLOCKED, alpha=0.5, ec="none", zorder=11))
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
     drawing.dress(axes, view, ticks=False)
 
 

@@ -95,7 +95,6 @@ def _cut_panel(axes: Axes, explanation: Explanation, layers: Layers) -> None:
     drawing.fit(axes, middle - half, middle + half)
     paint_cut(axes, layers, view, target)
     _paths(axes, explanation, view)
-    drawing.fit(axes, middle - half, middle + half)
     drawing.dress(axes, view, ticks=False)
     drawing.title(axes, "Cut through the target; paths are projected onto it")
 

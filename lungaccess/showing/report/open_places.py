@@ -43,13 +43,9 @@ def open_places_png(
     for box, view in zip(PANELS_IN, (CORONAL, AXIAL), strict=True):
         _panel(style.panel(figure, box), layers, view, proof, verdict, target_lps)
     figure.legend(
-        handles=_legend(verdict),
-        loc="lower left",
-        bbox_to_anchor=(0.02, 0.01),
-        ncols=3,
-        frameon=False,
+        handles=_legend(verdict), loc="lower left", bbox_to_anchor=(0.02, 0.01), ncols=3, frameon=False,
         fontsize=8.5,
-    )
+    )  # fmt: skip
     said = "proved unreachable" if verdict.proved else f"{len(verdict.open_places)} places are open"
     style.heading(
         figure, f"{lung.name}: {said}, {percent(verdict.share_ruled_out)} of the deployments ruled out"
@@ -76,15 +72,9 @@ def _panel(
         if number < NAMED:
             middle = dots.mean(axis=0)
             axes.text(
-                middle[0],
-                middle[1],
-                f" {number + 1}",
-                fontsize=10,
-                fontweight="bold",
-                color=style.INK,
-                path_effects=drawing.halo(2.5),
-                zorder=15,
-            )
+                middle[0], middle[1], f" {number + 1}", fontsize=10, fontweight="bold", color=style.INK,
+                path_effects=drawing.halo(2.5), zorder=15,
+            )  # fmt: skip
     spot = view.project(target_lps)
     drawing.target_mark(axes, spot, 19)
     drawing.fit_around(axes, lung, spot[None])

@@ -20,6 +20,7 @@ def pack(values: ArrayLike, kind: str) -> Packed:
     """Return an array as plain JSON values.
 
     The bytes are stored by significance (all lowest bytes first), which makes whole numbers deflate well.
+    Raises AnatomyError if a value is not finite, or too large for the type.
 
     Args:
         values (array_like of any shape): Its last axis runs fastest.
@@ -27,9 +28,6 @@ def pack(values: ArrayLike, kind: str) -> Packed:
 
     Returns:
         "kind", "shape" and "data": base64 of the zlib stream.
-
-    Raises:
-        AnatomyError: If a value is not finite, or too large for the type.
     """
     array = np.asarray(values)
     stored = np.ascontiguousarray(array, dtype=np.dtype(TYPES[kind]).newbyteorder("<"))
@@ -53,8 +51,7 @@ def unpack(packed: Packed) -> Array:
 def script_text(content: Any) -> str:
     """Return JSON that may be put into a script element: it holds no `<`.
 
-    Raises:
-        ValueError: If a number is not finite.
+    Raises ValueError if a number is not finite.
     """
     text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")

@@ -1,6 +1,7 @@
 """A route along tubes: from two sides, with its curvature and its distance to the wall."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.patches import Patch
 from anatomy.base.typed import Float
 from lungaccess.showing.report import drawing, style
 from lungaccess.showing.report.views import CORONAL, SAGITTAL, View
-from stages.scope.route import Centreline, Route
+from stages.scope.route import Centreline, Curve, Route
 
 WIDTH_IN, HEIGHT_IN = 15.0, 9.0
 VIEWS_IN = ((0.5, 3.6, 6.9, 4.7), (7.9, 3.6, 6.6, 4.7))
@@ -20,7 +21,6 @@ GRAPHS_IN = ((0.9, 0.95, 6.2, 2.1), (8.3, 0.95, 6.2, 2.1))
 FLAT = View(name="The drawing", right=np.array([1.0, 0, 0]), up=np.array([0, -1.0, 0]))
 PER_SPAN = 16
 """Points drawn for each span of the spline."""
-ALONG = "length along the curve, mm"
 AROUND_MM = 6.0
 """Border around the route in a picture."""
 
@@ -29,16 +29,23 @@ AROUND_MM = 6.0
 def route_png(name: str, centreline: Centreline, route: Route, path: str | os.PathLike[str]) -> Path:
     """Draw a route in its tubes, the tentative curve beside it, and both along their length.
 
-    Raises:
-        anatomy.base.errors.FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     flat = bool(np.ptp(centreline.nodes_mm[:, 2]) == 0.0)
     boxes = ((0.5, 3.6, 14.0, 4.7),) if flat else VIEWS_IN
     for box, view in zip(boxes, (FLAT,) if flat else (CORONAL, SAGITTAL), strict=True):
         _view(style.panel(figure, box), centreline, route, view)
-    _curvature_graph(style.panel(figure, GRAPHS_IN[0]), route)
-    _wall_graph(style.panel(figure, GRAPHS_IN[1]), centreline, route)
+    bend, wall = (style.panel(figure, box) for box in GRAPHS_IN)
+    most, least_mm = route.limits.max_curvature_per_mm, route.limits.needed_mm
+    _graph(bend, route, lambda curve, at: curve.curvature_per_mm(at), most, "curvature, 1/mm")
+    bend.set_ylim(0.0, 3.0 * most)
+
+    def depth_mm(curve: Curve, at: Float) -> Float:
+        return np.maximum(centreline.depth_mm(curve.at(at)[0]), -1.0)
+
+    _graph(wall, route, depth_mm, least_mm, "distance to the wall, mm")
+    wall.set_ylim(bottom=min(0.0, wall.get_ylim()[0]))
     verdict = "proved on the whole curve" if route.proved else "NOT PROVED"
     style.heading(
         figure, f"{name}: route of {route.curve.length_mm():.0f} mm, repair {route.repair!r}, {verdict}"
@@ -90,33 +97,14 @@ def _lumen(axes: Axes, centreline: Centreline, nodes: Float) -> None:
     axes.add_collection(lines)
 
 
-def _along(route: Route, *, tentative: bool) -> tuple[Float, Float]:
-    """Return parameters and the lengths along the curve at them."""
-    curve = route.tentative if tentative else route.curve
-    parameters = curve.parameters(PER_SPAN)
-    step = np.linalg.norm(np.diff(curve.at(parameters)[0], axis=0), axis=1)
-    return parameters, np.concatenate(((0.0,), np.cumsum(step)))
-
-
-def _curvature_graph(axes: Axes, route: Route) -> None:
-    limit = route.limits.max_curvature_per_mm
-    for curve, tentative, colour in ((route.tentative, True, style.TUBE), (route.curve, False, style.SCOPE)):
-        parameters, along = _along(route, tentative=tentative)
-        axes.plot(along, curve.curvature_per_mm(parameters), color=colour, lw=1.4)
+def _graph(axes: Axes, route: Route, value: Callable[[Curve, Float], Float], limit: float, name: str) -> None:
+    """Draw a value of both curves along their length, and its limit."""
+    for curve, colour in ((route.tentative, style.TUBE), (route.curve, style.SCOPE)):
+        parameters = curve.parameters(PER_SPAN)
+        step = np.linalg.norm(np.diff(curve.at(parameters)[0], axis=0), axis=1)
+        axes.plot(np.append(0.0, np.cumsum(step)), value(curve, parameters), color=colour, lw=1.4)
     axes.axhline(limit, color=style.INK, lw=1.0, ls=(0, (4, 3)))
-    axes.set_ylim(0.0, 3.0 * limit)
-    drawing.graph(axes, ALONG, "curvature, 1/mm")
-    axes.margins(x=0.0)
-
-
-def _wall_graph(axes: Axes, centreline: Centreline, route: Route) -> None:
-    for curve, tentative, colour in ((route.tentative, True, style.TUBE), (route.curve, False, style.SCOPE)):
-        parameters, along = _along(route, tentative=tentative)
-        depth = centreline.depth_mm(curve.at(parameters)[0])
-        axes.plot(along, np.maximum(depth, -1.0), color=colour, lw=1.4)
-    axes.axhline(route.limits.needed_mm, color=style.INK, lw=1.0, ls=(0, (4, 3)))
-    axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
-    drawing.graph(axes, ALONG, "distance to the wall, mm")
+    drawing.graph(axes, "length along the curve, mm", name)
     axes.margins(x=0.0)
 
 

@@ -21,10 +21,7 @@ from lungaccess.showing.report import drawing, style
 def cost_over_time_png(history: Sequence[CostPoint], path: str | os.PathLike[str], goal: Goal) -> Path:
     """Draw the best value of a goal against planning time; a search without a plan says so.
 
-    Costs fall, and chances of success rise.
-
-    Raises:
-        anatomy.base.errors.FileError: If the file cannot be written.
+    Costs fall, and chances of success rise.  Raises FileError if the file cannot be written.
     """
     figure = style.new_figure(8.0, 4.5)
     axes = figure.add_axes((0.105, 0.135, 0.86, 0.77))
@@ -86,8 +83,7 @@ class CostPoint:
 def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
     """Write one line a point: elapsed_s, iteration, best (empty before the first plan).
 
-    Raises:
-        anatomy.base.errors.FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

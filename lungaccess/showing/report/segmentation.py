@@ -31,12 +31,10 @@ def segmentation_png(ct: Volume, parts: Parts | None, path: str | os.PathLike[st
     """Draw the masks over the CT as it was measured: five sagittal, coronal and axial slices.
 
     Axial slices are seen from the feet, coronal ones from the front: the patient's right is on the left.
+    Raises FileError if the file cannot be written.
 
     Args:
         parts: Its voxels run along those of the CT; None draws the whole CT alone.
-
-    Raises:
-        anatomy.base.errors.FileError: If the file cannot be written.
     """
     low, high = _shown_lps(ct, parts)
     axis_of = [int(np.argmax(np.abs(ct.grid.lps_from_ijk[row, :3]))) for row in range(3)]
@@ -115,12 +113,9 @@ def _draw_parts(axes: Axes, parts: Parts, section: _Section) -> None:
     for mask, colour, alpha in (
         (fissures == UNKNOWN, NOT_KNOWN, 0.12),
         ((fissures >= LEAST_CHANCE) & (fissures < UNKNOWN), FISSURE, 0.25),
-        ((fissures > 0) & (fissures < LEAST_CHANCE), FISSURE, 0.9),
-        (parts.all_vessels, SMALL_VESSEL, 0.55),
-        (parts.large_vessels, LARGE_VESSEL, 0.75),
-        (parts.wall, WALL, 0.8),
-        (parts.lumen, style.SCOPE, 0.9),
-    ):
+        ((fissures > 0) & (fissures < LEAST_CHANCE), FISSURE, 0.9), (parts.all_vessels, SMALL_VESSEL, 0.55),
+        (parts.large_vessels, LARGE_VESSEL, 0.75), (parts.wall, WALL, 0.8), (parts.lumen, style.SCOPE, 0.9),
+    ):  # fmt: skip
         plane, extent = section.of(mask, parts.ct.grid)
         _fill(axes, plane, colour, alpha, extent)
     for mask, colour in (

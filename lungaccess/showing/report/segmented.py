@@ -16,13 +16,9 @@ if TYPE_CHECKING:
     from anatomy.segmentation.scan_warnings import Quality
 
 STEP_SHARES = {
-    "reading the CT": 0.02,
-    "checking the CT": 0.06,
-    "lungs: coarse image": 0.08,
-    "lungs: boundary": 0.14,
-    "lobes and fissures": 0.7,
-    "pictures": 0.95,
-}
+    "reading the CT": 0.02, "checking the CT": 0.06, "lungs: coarse image": 0.08, "lungs: boundary": 0.14,
+    "lobes and fissures": 0.7, "pictures": 0.95,
+}  # fmt: skip
 """Share of the work that is done when a step begins, as measured on a CT of 512 x 512 x 275 voxels."""
 PICTURE, REFUSED_PICTURE, BEGUN_PICTURE = "segmentation.png", "refused.png", "begun.png"
 """Names of the pictures in the folder of the patient."""
@@ -51,14 +47,13 @@ def segment_with_pictures(
 ) -> Segmented:
     """Segment a CT, and write quality.json and the pictures beside the masks.
 
+    Raises LungaccessError as `anatomy.segmentation.pipeline.segment`.
+
     Args:
         tell: Told each step as it begins, and the share of the work that is done then, None if not known.
         pictures: Whether pictures are drawn, also of a CT that is refused.
         begun: Is given a picture of lungs and airway as soon as they are made, so that a person need not wait
             for the longer steps where they are wrong.
-
-    Raises:
-        LungaccessError: As `anatomy.segmentation.pipeline.segment`.
     """
     from anatomy.segmentation.parts import RefusedError
     from anatomy.segmentation.pipeline import segment
@@ -96,10 +91,8 @@ def patient_folder(ct: Path, series: str | None = None) -> Path:
     """Return the folder in which the patient of a CT is made where none is named: NAME-patient, here.
 
     A folder that holds another patient, such as the one of a CT of the same name or of another series, is
-    left alone: then it is NAME-patient-2, and so on.
-
-    Raises:
-        FileError: If the record of a segmentation is damaged.
+    left alone: then it is NAME-patient-2, and so on.  Raises FileError if the record of a segmentation is
+    damaged.
     """
     from anatomy.io.images import image_stem
 

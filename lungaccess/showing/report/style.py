@@ -61,16 +61,12 @@ def heading(figure: Figure, text: str, *, size: float = 14.0) -> None:
 def save_png(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure to `path` in one step, so that no half-written picture can be seen.
 
-    Raises:
-        FileError: If the folder is missing or cannot be written.
+    Raises FileError if the folder is missing or cannot be written.
     """
     target = Path(path)
     with atomic_write(target) as temporary:
         figure.savefig(
-            temporary,
-            format="png",
-            dpi=DPI,
-            metadata={"Software": "lungaccess"},
+            temporary, format="png", dpi=DPI, metadata={"Software": "lungaccess"},
             pil_kwargs={"compress_level": PNG_LEVEL},
-        )
+        )  # fmt: skip
     return target

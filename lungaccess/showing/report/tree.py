@@ -42,14 +42,11 @@ def tree_png(lung: Lung, path: str | os.PathLike[str]) -> Path:
     for box, view in zip(PANELS_IN, STANDARD, strict=True):
         axes = style.panel(figure, box)
         _tree_panel(axes, lung.tree, layers, view, colours, norm)
-    bar_axes = style.panel(figure, BAR_IN)
-    bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=bar_axes)
-    generations = np.arange(int(np.max(lung.tree.generation)) + 1)
-    bar.set_ticks(generations.tolist(), labels=[str(g) for g in generations], fontsize=8)
+    bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=style.panel(figure, BAR_IN))
+    bar.set_ticks(range(deepest + 1), labels=[str(g) for g in range(deepest + 1)], fontsize=8)
     bar.set_label("generation (trachea 0)", fontsize=9)
     style.heading(
-        figure,
-        f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {generations[-1]}",
+        figure, f"Airway tree of {lung.name}: {lung.tree.n_branches} branches, up to generation {deepest}"
     )
     return style.save_png(figure, path)
 
@@ -126,12 +123,9 @@ def _panel(axes: Axes, organ: Organ, layers: Layers, view: View) -> None:
     for pose in organ.starts:
         tail, tip = view.project(pose[:3, 3] - ARROW_MM * pose[:3, 2]), view.project(pose[:3, 3])
         axes.annotate(
-            "",
-            xy=(tip[0], tip[1]),
-            xytext=(tail[0], tail[1]),
-            arrowprops={"color": style.INK, "arrowstyle": "-|>"},
-            zorder=9,
-        )
+            "", xy=(tip[0], tip[1]), xytext=(tail[0], tail[1]),
+            arrowprops={"color": style.INK, "arrowstyle": "-|>"}, zorder=9,
+        )  # fmt: skip
         shown += [tail, tip]
     for point in organ.targets_lps:
         drawing.target_mark(axes, view.project(point))

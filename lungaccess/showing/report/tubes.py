@@ -43,16 +43,14 @@ def tubes_png(
 ) -> Path:
     """Draw deployed tubes: side and front view, torsion, and stability.
 
-    All coordinates are those of the scope tip: z forward, mm.
+    All coordinates are those of the scope tip: z forward, mm.  Raises FileError if the file cannot be
+    written.
 
     Args:
         equilibrium: What to draw; at least one tube must be out of the scope.
         deployed: Its earlier steps are drawn as thin grey lines.
         scope_diameter_mm: Drawn around the tubes; a little more than the outermost tube's if None.
         notes: Lines to print beside the picture.
-
-    Raises:
-        anatomy.base.errors.FileError: If the file cannot be written.
     """
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     widest = scope_diameter_mm or 1.15 * equilibrium.mechanics.tubes[-1].outer_diameter_mm
@@ -98,24 +96,15 @@ def _side_view(axes: Axes, equilibrium: Equilibrium, lines: Sequence[Float], sco
     for number, tube, points in _outermost_first(equilibrium):
         fill = 0.9 if number == 0 else 0.4
         drawing.ribbon(
-            axes,
-            project(points),
-            tube.radius_mm,
-            TUBE_COLOURS[number % 4],
-            fill=fill,
+            axes, project(points), tube.radius_mm, TUBE_COLOURS[number % 4], fill=fill,
             order=5 + min(number, 4),
-        )
+        )  # fmt: skip
     axes.add_patch(
         Rectangle(
-            (-SCOPE_LENGTH_MM, -scope_mm / 2),
-            SCOPE_LENGTH_MM,
-            scope_mm,
-            facecolor=style.SCOPE,
-            alpha=0.35,
-            edgecolor=style.SCOPE,
-            zorder=3,
+            (-SCOPE_LENGTH_MM, -scope_mm / 2), SCOPE_LENGTH_MM, scope_mm, facecolor=style.SCOPE, alpha=0.35,
+            edgecolor=style.SCOPE, zorder=3,
         )  # fmt: skip
-    )
+    )  # fmt: skip
     every = np.concatenate([project(line) for line in lines])
     low = np.minimum(every.min(axis=0), [-SCOPE_LENGTH_MM, -scope_mm / 2]) - 1.5
     drawing.fit(axes, low, np.maximum(every.max(axis=0), [0.0, scope_mm / 2]) + 1.5)

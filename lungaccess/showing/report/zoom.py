@@ -16,13 +16,9 @@ PIXELS = 520
 SLAB_MM = (-2.0, -1.0, 1.0, 2.0)
 # Painted in this order; a later layer covers an earlier one.
 PAINT = (
-    ("lung", style.LUNG),
-    ("outside", "#C9C9C9"),
-    ("fissure", style.FISSURE),
-    ("airway", style.AIRWAY),
-    ("lumen", style.LUMEN),
-    ("vessel", style.VESSEL),
-)
+    ("lung", style.LUNG), ("outside", "#C9C9C9"), ("fissure", style.FISSURE), ("airway", style.AIRWAY),
+    ("lumen", style.LUMEN), ("vessel", style.VESSEL),
+)  # fmt: skip
 
 
 def exit_zoom(axes: Axes, plan: Plan, layers: Layers) -> None:
@@ -89,7 +85,6 @@ def goal_marks(axes: Axes, plan: Plan, view: View) -> None:
 def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     """Draw scope, tubes and needle as bands of their own width."""
     system = plan.system
-    limits = axes.get_xlim(), axes.get_ylim()
     body, tube, needle = plan.curves()
     scope = view.project(body.points_lps)
     tube_uv, needle_uv = view.project(tube.points_lps), view.project(needle.points_lps)
@@ -105,8 +100,6 @@ def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     if system.needle is not None:
         drawing.ribbon(axes, needle_uv, system.needle.radius_mm, style.NEEDLE, fill=0.9, order=9)
         drawing.dashed_band(axes, needle_uv, required["needle"], 5)
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
 
 
 def paint_cut(axes: Axes, layers: Layers, view: View, through: Float) -> None:

@@ -195,19 +195,14 @@ def profile(plan: Plan, lung: Lung) -> dict[str, Any]:
     clearances["airway"][along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
     exit_mm = float(plan.tube.exit.arc_length_mm)
     return {
-        "arc_length_mm": along,
-        "tube_mm": start,
-        "exit_mm": exit_mm,
+        "arc_length_mm": along, "tube_mm": start, "exit_mm": exit_mm,
         "marks": {"exit": exit_mm, **({} if plan.needle is None else {"needle": start})},
         "exempt_to_mm": start + float(plan.exemption.needle_length_mm),
-        "fissures_are_obstacles": plan.fissures_are_obstacles,
-        "cap_mm": CAP_MM,
-        "clearance_mm": clearances,
-        "required_mm": required_mm(plan, along, start),
-        "curvature_per_mm": _curvature(plan, along),
+        "fissures_are_obstacles": plan.fissures_are_obstacles, "cap_mm": CAP_MM, "clearance_mm": clearances,
+        "required_mm": required_mm(plan, along, start), "curvature_per_mm": _curvature(plan, along),
         "most_curvature_per_mm": 0.0 if device is None else device.max_curvature_per_mm,
         **_cost_so_far(plan, lung),
-    }
+    }  # fmt: skip
 
 
 def _margin_mm(plan: Plan, lung: Lung) -> Float:

@@ -46,8 +46,7 @@ def bundle(names: Sequence[str]) -> str:
 def filled(template: str, parts: Mapping[str, str]) -> str:
     """Return a template with each `{{name}}` replaced by the part of that name, in one pass.
 
-    Raises:
-        KeyError: If a part is missing.
+    Raises KeyError if a part is missing.
     """
     return _HOLE.sub(lambda hole: parts[hole.group(1)], template)
 
@@ -71,24 +70,20 @@ def write_page(
 ) -> Path:
     """Write a page, all or nothing.
 
+    Raises FileError if the file cannot be written.
+
     Args:
         template: Name of the page's own HTML, which goes into the body.
         modules: Scripts of this page, after `SHARED_MODULES`.
         data: Plain JSON values; the scripts find them in the element "report-data".
         parts: HTML for the holes of the template; "title" is plain text, escaped already.
-
-    Raises:
-        FileError: If the file cannot be written.
     """
     whole = filled(
         asset("frame.html"),
         {
-            "title": parts["title"],
-            "style": asset("style.css"),
-            "body": filled(asset(template), parts),
-            "data": script_text(data),
-            "script": bundle([*SHARED_MODULES, *modules]),
+            "title": parts["title"], "style": asset("style.css"), "body": filled(asset(template), parts),
+            "data": script_text(data), "script": bundle([*SHARED_MODULES, *modules]),
         },
-    )
+    )  # fmt: skip
     write_text(os.fspath(path), whole)
     return Path(path)

@@ -78,16 +78,12 @@ START_LOOKS = (
 
 def structure_meshes(lung: Lung) -> list[Packed]:
     """Return the surfaces of a patient's structures for a page, kept with it; those it lacks are left out."""
-    return list(kept(lung, "surfaces", SURFACES_VERSION, lambda: _structure_meshes(lung)))
 
+    def made() -> list[Packed]:
+        volumes = ((look, structure(lung, look.key)) for look in LOOKS)
+        return [packed_surface(volume, look) for look, volume in volumes if volume and volume.array.any()]
 
-def _structure_meshes(lung: Lung) -> list[Packed]:
-    found = []
-    for look in LOOKS:
-        volume = structure(lung, look.key)
-        if volume is not None and volume.array.any():
-            found.append(packed_surface(volume, look))
-    return found
+    return list(kept(lung, "surfaces", SURFACES_VERSION, made))
 
 
 def start_meshes(region: StartRegion) -> list[Packed]:
@@ -128,16 +124,11 @@ def packed_mesh(vertices: Float, faces: Int, look: Look) -> Packed:
     first = faces[:, 0]
     differences = [np.diff(first, prepend=0), faces[:, 1] - first, faces[:, 2] - first]
     return {
-        "key": look.key,
-        "name": look.name,
-        "colour": look.colour,
-        "opacity": look.opacity,
-        "shown": look.shown,
-        "low_lps": low.tolist(),
-        "size_mm": size.tolist(),
+        "key": look.key, "name": look.name, "colour": look.colour, "opacity": look.opacity,
+        "shown": look.shown, "low_lps": low.tolist(), "size_mm": size.tolist(),
         "vertices": pack(np.rint((vertices - low) / size * STEPS).astype(np.uint16), "u2"),
         "faces": pack(np.stack(differences), "i4"),
-    }
+    }  # fmt: skip
 
 
 def surface(volume: Volume, look: Look) -> tuple[Float, Int]:

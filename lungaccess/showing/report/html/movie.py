@@ -31,13 +31,11 @@ def bronchoscopy_webp(
     """Write what the scope's camera sees on its route to the plan's site as an animated WebP.
 
     Up is where a positive bend turns the tip: the picture rolls with the twist.  The wall is where blurred
-    lumen is half full, so that voxels do not show; no device is drawn.
+    lumen is half full, so that voxels do not show; no device is drawn.  Raises FileError if the file cannot
+    be written.
 
     Args:
         frames, pixels: Number of pictures, and their width and height.
-
-    Raises:
-        FileError: If the file cannot be written.
     """
     from PIL import Image
 

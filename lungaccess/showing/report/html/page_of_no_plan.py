@@ -26,8 +26,7 @@ PLACES = '<label>Through <select id="place"></select></label>'
 def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Write the page of a search that found no plan to one HTML file that opens offline.
 
-    Raises:
-        FileError: If the file cannot be written.
+    Raises FileError if the file cannot be written.
     """
     rows = [(reason, count) for reason, count in explanation.failure.reasons.items() if count]
     parts = {
@@ -115,10 +114,7 @@ def _devices(name: str, colour: str, plan: Plan, shown: bool) -> tuple[Packed, F
 
 def _path(name: str, colour: str, radius_mm: float, curves: list[Float], shown: bool) -> tuple[Packed, Float]:
     packed = {
-        "name": name,
-        "colour": colour,
-        "radius_mm": radius_mm,
-        "shown": shown,
+        "name": name, "colour": colour, "radius_mm": radius_mm, "shown": shown,
         "curves": [pack(curve, "f4") for curve in curves],
-    }
+    }  # fmt: skip
     return packed, curves[-1]

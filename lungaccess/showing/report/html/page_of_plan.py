@@ -102,7 +102,9 @@ def plan_page(
         "breathing": breathing.window_headline(plan, lung, first.accepted),
         "phase_player": breathing.player(window, first.accepted),
         "charts": _charts(plans, lung, moved)
-        + charts.history_figure(cost_history(chosen.cost_over_time), made_small(plan)),
+        + charts.history_figure(
+            cost_history(chosen.cost_over_time), "best cost" if plan.chance is None else SUCCESS.words
+        ),
         "phase_slices": breathing.slices_note(window),
         "limits": tables.limits_section(first),
         "summary": summary(plan, lung),
@@ -207,11 +209,6 @@ def page_data(
         **page_image(lung, near, options.ct),
         **breathing.packed_breath(plans, lung, moved),
     }
-
-
-def made_small(plan: Plan) -> str:
-    """Say what a search made small over its time."""
-    return "best cost" if plan.chance is None else SUCCESS.words
 
 
 def image_source(lung: Lung, ct_name: str) -> str:

@@ -31,11 +31,10 @@ SURFACES = {
 def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str]) -> Path:
     """Write the page of one or several maps of a lung to one HTML file that opens offline.
 
+    Raises FileError if the file cannot be written.
+
     Args:
         maps: All of one lung; each has its own system.
-
-    Raises:
-        FileError: If the file cannot be written.
     """
     first = maps[0]
     centre = fullest_point(first.kinds)
@@ -56,15 +55,10 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
         "systems": systems_section(maps),
     }
     data = {
-        "page": "reach",
-        "patient": lung.name,
-        "structures": structure_meshes(lung),
-        **page_image(lung, centre[None]),
-        "centre_lps": centre.tolist(),
-        "colours": COLOURS,
-        "clearance_range_mm": list(CLEARANCE_MM),
-        "maps": [packed_map(each) for each in maps],
-    }
+        "page": "reach", "patient": lung.name, "structures": structure_meshes(lung),
+        **page_image(lung, centre[None]), "centre_lps": centre.tolist(), "colours": COLOURS,
+        "clearance_range_mm": list(CLEARANCE_MM), "maps": [packed_map(each) for each in maps],
+    }  # fmt: skip
     return write_page(path, "reach.html", MODULES, data, parts)
 
 
@@ -74,15 +68,12 @@ def packed_map(reach: ReachMap) -> Packed:
 
     clearance = np.clip(np.rint(reach.clearance_mm.array * STEPS_PER_MM), 0, 255).astype(np.uint8)
     return {
-        "name": reach.system.name,
-        "kinds": {name: int(code) for name, code in KINDS.items()},
-        "lps_from_ijk": reach.kinds.grid.lps_from_ijk.tolist(),
-        "shape": list(reach.kinds.grid.shape),
+        "name": reach.system.name, "kinds": {name: int(code) for name, code in KINDS.items()},
+        "lps_from_ijk": reach.kinds.grid.lps_from_ijk.tolist(), "shape": list(reach.kinds.grid.shape),
         "kind": pack(reach.kinds.array.transpose(2, 1, 0), "u1"),
-        "clearance": pack(clearance.transpose(2, 1, 0), "u1"),
-        "steps_per_mm": STEPS_PER_MM,
+        "clearance": pack(clearance.transpose(2, 1, 0), "u1"), "steps_per_mm": STEPS_PER_MM,
         "surfaces": _surfaces(reach),
-    }
+    }  # fmt: skip
 
 
 def _surfaces(reach: ReachMap) -> list[Packed]:
@@ -133,14 +124,10 @@ def systems_section(maps: Sequence[ReachMap]) -> str:
     for each in maps:
         gained, lost = each.gained_and_lost_ml(maps[0])
         figures: list[Any] = [
-            f"{each.system.scope.outer_diameter_mm:g}",
-            *each.system.needle_sizes,
-            "are obstacles" if each.with_fissures else "may be crossed or have no mask",
-            each.entries,
-            of_hundred(each.total.reached),
-            f"{gained:.0f}",
-            f"{lost:.0f}",
-        ]
+            f"{each.system.scope.outer_diameter_mm:g}", *each.system.needle_sizes,
+            "are obstacles" if each.with_fissures else "may be crossed or have no mask", each.entries,
+            of_hundred(each.total.reached), f"{gained:.0f}", f"{lost:.0f}",
+        ]  # fmt: skip
         rows.append((words.text(each.system.name), *(words.text(figure) for figure in figures)))
     headings = (
         "system", "scope, mm", "needle, mm", "radius of curvature, mm", "fissures", "deployments",

@@ -47,8 +47,7 @@ class CtFile:
     def read(self) -> Volume:
         """Return the CT in HU.
 
-        Raises:
-            FileError: If it cannot be read, or is not the one that was segmented.
+        Raises FileError if it cannot be read, or is not the one that was segmented.
         """
         from anatomy.io.dicom import read_dicom
         from anatomy.io.images import read_volume
@@ -78,8 +77,7 @@ def find_ct(patient: Path) -> CtFile | None:
 def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:
     """Return the voxels that the slices of a page show: structures, and a CT if there is one.
 
-    Raises:
-        AnatomyError: If the CT does not hold the devices.
+    Raises AnatomyError if the CT does not hold the devices.
     """
     labels = label_volumes(lung, device_lps)
     return _image(lung, labels, ct, None if ct is None else ct_volumes(ct, lung, device_lps))
@@ -88,8 +86,7 @@ def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
 def fine_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packed:
     """Return the fine voxels of `page_image` alone, which takes a tenth of the time.
 
-    Raises:
-        AnatomyError: If the CT does not hold the devices.
+    Raises AnatomyError if the CT does not hold the devices.
     """
     fine = page_grids(lung.grid, device_lps)[1]
     if ct is not None:
@@ -101,12 +98,9 @@ def fine_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
 def _image(lung: Lung, labels: list[Packed], ct: Volume | None, voxels: list[Packed] | None) -> Packed:
     grid = lung.grid if ct is None else ct.grid
     return {
-        "codes": CODES,
-        "labels": labels,
-        "ct": voxels,
-        "hounsfield": HU_OF_BYTE.tolist(),
+        "codes": CODES, "labels": labels, "ct": voxels, "hounsfield": HU_OF_BYTE.tolist(),
         "grid": {"shape": list(grid.shape), "lps_from_ijk": grid.lps_from_ijk.tolist()},
-    }
+    }  # fmt: skip
 
 
 def image_words(image: Packed) -> str:
@@ -133,12 +127,9 @@ def label_codes(lung: Lung, low: ArrayLike, high: ArrayLike) -> Volume:
     labels = lung.labels[box]
     codes = np.full(labels.shape, CODES["lung"], dtype=np.uint8, order="F")
     for bit, name in (
-        (OUTSIDE, "outside"),
-        (FISSURE, "fissure"),
-        (AIRWAY, "airway wall"),
-        (LUMEN, "lumen"),
+        (OUTSIDE, "outside"), (FISSURE, "fissure"), (AIRWAY, "airway wall"), (LUMEN, "lumen"),
         (VESSEL, "vessel"),
-    ):
+    ):  # fmt: skip
         codes[(labels & bit) != 0] = CODES[name]
     if lung.nodules is not None:
         codes[lung.nodules.array[box] & (codes == CODES["lung"])] = CODES["nodule"]
@@ -157,8 +148,7 @@ def label_volumes(lung: Lung, device_lps: Float) -> list[Packed]:
 
 def _fine_labels(lung: Lung, fine: Grid) -> Packed:
     shape = np.array(lung.grid.shape)
-    corners = np.stack(np.meshgrid(*[(0, n - 1) for n in fine.shape], indexing="ij"), axis=-1).reshape(-1, 3)
-    places = np.floor(lung.grid.ijk(fine.lps(corners))).astype(np.int64)
+    places = np.floor(lung.grid.ijk(fine.corners_lps)).astype(np.int64)
     low = np.clip(places.min(axis=0) - 2, 0, shape - 1)
     high = np.clip(places.max(axis=0) + 4, low + 1, shape)
     return _labels_on(lung, fine, low, high)
@@ -172,8 +162,7 @@ def _labels_on(lung: Lung, grid: Grid, low: Int, high: Int) -> Packed:
 def ct_volumes(ct: Volume, lung: Lung, device_lps: Float) -> list[Packed]:
     """Return a CT, coarse and fine, for a page: as coarse as it must be to stay small.
 
-    Raises:
-        AnatomyError: If the CT does not hold the devices.
+    Raises AnatomyError if the CT does not hold the devices.
     """
     _require_holds(ct, device_lps)
     factor = 1.0

@@ -13,6 +13,7 @@ export class Exits {
   constructor(answer) {
     const { arrays } = answer;
     Object.assign(this, { answer, entries: arrays.entry, tips: arrays.tip, count: arrays.entry.length });
+    this.unlisted = this.count > MOST_LISTED ? `${this.count - MOST_LISTED} more are painted` : "";
     this.places = Array.from(arrays.entry, (_, n) => point(arrays.points, n));
   }
 
@@ -37,10 +38,6 @@ export class Exits {
       button(`${n + 1}`, `Plan from exit ${n + 1}`, () => choose(this.entries[n]), { ariaPressed: String(n === chosen) }),
       mm(clearance[n]), mm(length[n], 0), String(count[n]),
     ]);
-  }
-
-  get unlisted() {
-    return this.count > MOST_LISTED ? `${this.count - MOST_LISTED} more are painted` : "";
   }
 }
 

@@ -15,8 +15,8 @@ GLSL = "glsl.js"
 """The module that is made of `shaders/`, so that programs are files of their own language."""
 SHARED_MODULES = (
     "decode.js", "vectors.js", "colours.js", "surfaces.js", GLSL, "shaders.js", "layers.js", "picking.js",
-    "solids.js", "scene.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js", "slice_views.js",
-    "structures.js", "slice_panel.js", "view_tools.js", "anatomy_page.js",
+    "solids.js", "scene.js", "gestures.js", "orbit.js", "voxels.js", "voxel_image.js", "slices.js",
+    "slice_views.js", "structures.js", "slice_panel.js", "view_tools.js", "anatomy_page.js",
 )  # fmt: skip
 _IMPORT = re.compile(r"^import .*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(async )?(function|class|const|let) )", re.MULTILINE)

@@ -16,6 +16,10 @@ const REST_MS = 300, FINE_MS = 900, PICTURES = 4;
 // A page with its data; `shownFirst` lists the structures that are shown at first, if not those that say so.  It has
 //   cutThrough(): through which point a cut goes, along which axis, and what it is called, null for no cut;
 //   distancesOf(point): words on how far a point is from what matters.
+// It may have
+//   labels(): those in the view, { text, point: LPS mm, colour };
+//   alongMm(a, b): how far apart two points are along the devices, in mm, null without devices;
+//   films(): what films can show besides a turn, { key, name }; filmAt(key, share) then moves the page.
 export class AnatomyPage {
   constructor(data, shownFirst = null) {
     this.data = data;
@@ -108,24 +112,9 @@ export class AnatomyPage {
     return true;
   }
 
-  // Return labels in the view: { text, point: LPS mm, colour }.
-  labels() {
-    return [];
-  }
-
   // Name what was hit in the 3-D view.
   nameOf({ kind, key }) {
     return kind === "surface" ? this.scene.surfaces.get(key).name : key;
-  }
-
-  // Return how far apart two points are along the devices, in mm; null without devices.
-  alongMm() {
-    return null;
-  }
-
-  // Return what films can show besides a turn: { key, name }; filmAt(key, share) then moves the page.
-  films() {
-    return [];
   }
 
   listStructures() {

@@ -12,14 +12,11 @@ function bytesOf(base64) {
   return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 }
 
-async function inflated(bytes) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
-}
-
 // Return the flat typed array of a packed one.
 export async function unpack(packed) {
-  const planes = await inflated(bytesOf(packed.data)), Kind = TYPES[packed.kind], width = Kind.BYTES_PER_ELEMENT;
+  const stream = new Blob([bytesOf(packed.data)]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const planes = new Uint8Array(await new Response(stream).arrayBuffer());
+  const Kind = TYPES[packed.kind], width = Kind.BYTES_PER_ELEMENT;
   if (width === 1) return planes;
   const count = planes.length / width, joined = new Uint8Array(planes.length);
   for (let b = 0; b < width; b++) {

@@ -1,8 +1,6 @@
 // The pictures that are put together: the solid bodies, and for each structure its nearest layers.
 const NOTHING = [0, 1, 1, 0];
 
-const LAYERS = 2;
-
 // Framebuffers of one size: `solids` holds colour and depth, `peeled[k][n]` the layer k of the structure n.
 export class Layers {
   constructor(gl) {
@@ -25,7 +23,7 @@ export class Layers {
     this.solids = this.framebuffer([this.colour, this.known]);
     // A framebuffer for the second picture of the solid bodies alone, to read from.
     this.reading = this.framebuffer([this.known]);
-    this.arrays = Array.from({ length: LAYERS }, () => this.texture(gl.TEXTURE_2D_ARRAY));
+    this.arrays = [0, 1].map(() => this.texture(gl.TEXTURE_2D_ARRAY));
     this.peeled = this.arrays.map((array) => Array.from({ length: this.slices }, (_, n) => this.framebuffer([array], n)));
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return true;

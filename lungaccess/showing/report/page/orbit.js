@@ -1,11 +1,11 @@
 // The camera that goes round the patient: by mouse, by fingers and by keys.
+import { connectGestures } from "./gestures.js";
 import { distanceToSee } from "./scene.js";
 import { add, cross, letters, minus, norm, times, unit } from "./vectors.js";
 
 const TURN_KEYS = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
 const VIEWS = { front: [0, 0], left: [Math.PI / 2, 0], right: [-Math.PI / 2, 0], back: [Math.PI, 0], feet: [0, -1.45] };
 
-const CLICK_PX = 5;
 const BETTER = 1.35;
 
 export class Orbit {
@@ -16,22 +16,15 @@ export class Orbit {
     this.changed = changed;
     // Called with the event of a press that did not drag.
     this.clicked = () => {};
-    this.fingers = new Map();
     this.look("front");
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      this.pressed = [event.clientX, event.clientY];
+    connectGestures(canvas, new Map(), {
+      dragged: ({ shiftKey, buttons }, [x, y]) => (shiftKey || buttons === 2 ? this.pan(x, y) : this.turn(-x * 0.008, y * 0.008)),
+      pinched: (_event, factor, [x, y]) => {
+        this.zoom(factor);
+        this.pan(x, y);
+      },
+      tapped: (event) => this.clicked(event),
     });
-    canvas.addEventListener("pointerup", (event) => {
-      const still = this.pressed && Math.hypot(event.clientX - this.pressed[0], event.clientY - this.pressed[1]) < CLICK_PX;
-      if (still && this.fingers.size === 1) this.clicked(event);
-      this.pressed = null;
-    });
-    canvas.addEventListener("pointermove", (event) => this.drag(event));
-    for (const kind of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(kind, (event) => this.fingers.delete(event.pointerId));
-    }
     canvas.addEventListener("wheel", (event) => {
       if (document.activeElement !== canvas && !event.ctrlKey) return;
       event.preventDefault();
@@ -80,24 +73,6 @@ export class Orbit {
     const scale = this.distance * 0.0012;
     this.centre = add(this.centre, add(times(right, -x * scale), times(above, y * scale)));
     this.changed();
-  }
-
-  drag(event) {
-    const before = this.fingers.get(event.pointerId);
-    if (!before) return;
-    const now = [event.clientX, event.clientY];
-    const [x, y] = [now[0] - before[0], now[1] - before[1]];
-    if (this.fingers.size > 1) {
-      const other = [...this.fingers].find(([id]) => id !== event.pointerId)[1];
-      const distance = (a) => Math.hypot(a[0] - other[0], a[1] - other[1]) || 1;
-      this.fingers.set(event.pointerId, now);
-      this.zoom(distance(before) / distance(now));
-      this.pan(x / 2, y / 2);
-      return;
-    }
-    this.fingers.set(event.pointerId, now);
-    if (event.shiftKey || event.buttons === 2) this.pan(x, y);
-    else this.turn(-x * 0.008, y * 0.008);
   }
 
   key(event) {

@@ -2,7 +2,6 @@
 import { byId, made, swatch } from "./structures.js";
 import { minus, norm } from "./vectors.js";
 
-// Connects the controls with slices.
 export class SlicePanel {
   // said(place): further words about a place, such as its distance from the target.
   constructor(views, said = () => []) {

@@ -1,9 +1,9 @@
 // Slices that belong together: one cross in all of them, moved, scrolled, zoomed and windowed by mouse, fingers and keys.
+import { connectGestures } from "./gestures.js";
 import { add, cross, dot, minus, times } from "./vectors.js";
 
 const LEAST_MM = 8, MOST_MM = 600;
 const WHEEL_PX = 60, ZOOM_PER_PX = 0.0015;
-const TAP_PX = 5;
 // A dragged pixel of the page changes level and width by so much of the width, but at least by so many HU.
 const WINDOW_SHARE = 0.004, LEAST_WINDOW_HU = 1;
 const SHIFTS = { ArrowLeft: [-1, 0, 0], ArrowRight: [1, 0, 0], ArrowUp: [0, 1, 0], ArrowDown: [0, -1, 0], PageUp: [0, 0, -1], PageDown: [0, 0, 1] };
@@ -36,10 +36,16 @@ export class SliceViews {
     canvas.tabIndex = 0;
     canvas.classList.add("moved");
     listen("wheel", this.wheel, { passive: false });
-    listen("pointerdown", this.press);
-    listen("pointermove", this.drag);
-    listen("pointerup", this.release);
-    listen("pointercancel", (event) => this.fingers.delete(event.pointerId));
+    connectGestures(canvas, this.fingers, {
+      pressed: (event) => this.press(event, name, slice),
+      dragged: (event, by) => this.drag(event, by, name, slice),
+      pinched: (event, factor, by) => {
+        this.zoom(factor, this.placeAt(event, slice));
+        this.pan(...by, slice);
+      },
+      tapped: (event) => this.tap(event, name, slice),
+      hovered: (event) => this.pointed(this.placeAt(event, slice), name),
+    });
     listen("pointerleave", () => this.pointed(null, name));
     listen("contextmenu", (event) => event.preventDefault());
     listen("dblclick", () => this.lookAt(this.place));
@@ -115,10 +121,6 @@ export class SliceViews {
 
   press(event, name, slice) {
     if (event.button === 1) event.preventDefault();
-    slice.canvas.setPointerCapture(event.pointerId);
-    const at = [event.clientX, event.clientY];
-    this.fingers.set(event.pointerId, { first: at, last: at, far: this.fingers.size > 0 });
-    if (this.fingers.size > 1) for (const finger of this.fingers.values()) finger.far = true;
     if (this.kindOf(event) === "cross" && event.pointerType === "mouse") this.set(this.placeAt(event, slice), name);
   }
 
@@ -129,26 +131,11 @@ export class SliceViews {
     return this.dragging;
   }
 
-  drag(event, name, slice) {
-    const finger = this.fingers.get(event.pointerId);
-    if (!finger) {
-      this.pointed(this.placeAt(event, slice), name);
-      return;
-    }
-    const now = [event.clientX, event.clientY], [dx, dy] = [now[0] - finger.last[0], now[1] - finger.last[1]];
-    if (Math.hypot(now[0] - finger.first[0], now[1] - finger.first[1]) > TAP_PX) finger.far = true;
-    const other = [...this.fingers.entries()].find(([id]) => id !== event.pointerId);
-    if (other) {
-      const apart = (at) => Math.hypot(at[0] - other[1].last[0], at[1] - other[1].last[1]) || 1;
-      this.zoom(apart(finger.last) / apart(now), this.placeAt(event, slice));
-      this.pan(dx / 2, dy / 2, slice);
-    } else if (finger.far) {
-      const kind = this.kindOf(event);
-      if (kind === "pan") this.pan(dx, dy, slice);
-      else if (kind === "window") this.window(dx, -dy);
-      else this.set(this.placeAt(event, slice), name);
-    }
-    finger.last = now;
+  drag(event, [dx, dy], name, slice) {
+    const kind = this.kindOf(event);
+    if (kind === "pan") this.pan(dx, dy, slice);
+    else if (kind === "window") this.window(dx, -dy);
+    else this.set(this.placeAt(event, slice), name);
   }
 
   pan(dx, dy, { plane, canvas }) {
@@ -166,10 +153,8 @@ export class SliceViews {
     this.changed();
   }
 
-  release(event, name, slice) {
-    const finger = this.fingers.get(event.pointerId);
-    this.fingers.delete(event.pointerId);
-    if (!finger || finger.far || event.button !== 0 || event.shiftKey || this.dragging !== "cross") return;
+  tap(event, name, slice) {
+    if (event.button !== 0 || event.shiftKey || this.dragging !== "cross") return;
     const place = this.placeAt(event, slice);
     this.set(place, name);
     this.picked(place, name);

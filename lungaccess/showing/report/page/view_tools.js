@@ -44,7 +44,7 @@ export class ViewTools {
   }
 
   afterDrawing() {
-    const labels = [...this.page.labels(), ...this.measureLabel()];
+    const labels = [...this.page.labels?.() ?? [], ...this.measureLabel()];
     this.find("scene-labels").replaceChildren(...labels.flatMap(({ text, point, colour }) => {
       const at = this.page.scene.project(point);
       return at ? made("span", { style: `border-color: ${colour}; transform: ${shiftBy(at)}` }, text) : [];
@@ -123,7 +123,7 @@ export class ViewTools {
 
   // Return the length in mm, and how far apart the places are along the devices.
   measureWords() {
-    const [a, b] = this.measured, along = this.page.alongMm(a, b);
+    const [a, b] = this.measured, along = this.page.alongMm?.(a, b) ?? null;
     return `${norm(minus(b, a)).toFixed(1)} mm${along === null ? "" : `; ${along.toFixed(1)} mm along tubes and needle`}`;
   }
 
@@ -152,7 +152,7 @@ export class ViewTools {
   // Saving ------------------------------------------------------------------------------------------------------------
 
   connectSaving() {
-    for (const { key, name } of this.page.films()) this.find("film-kind").append(new Option(name, key));
+    for (const { key, name } of this.page.films?.() ?? []) this.find("film-kind").append(new Option(name, key));
     this.find("save-picture").addEventListener("click", async () => save(await this.picture(), `${this.fileName()}.png`));
     this.filmType = this.canvas.captureStream && window.MediaRecorder && FILM_TYPES.find((type) => MediaRecorder.isTypeSupported(type));
     if (!this.filmType) Object.assign(this.find("save-film"), { disabled: true, title: "This browser records no film" });

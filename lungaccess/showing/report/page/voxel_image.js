@@ -11,7 +11,6 @@ const GROUND = ["outside", "lung"];
 export const WINDOWS = { lung: [-1350, 150], tissue: [-160, 240], bone: [-500, 1300] };
 export const LEAST_WIDTH_HU = 10;
 
-// The voxels of a page: structures, a CT if there is one, and a further layer painted over them.
 export class VoxelImage {
   static async of(data) {
     const image = new VoxelImage();

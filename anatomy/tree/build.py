@@ -23,14 +23,25 @@ from anatomy.tree.voxel_tree import (
     voxel_tree_of,
 )
 
+MOST_LUMEN_ML = 1000.0
+"""A lumen of more millilitres is no airway: those of adults have 20 to 200, and lungs have litres.  To find
+middle lines of lungs takes many minutes."""
+
 
 def tree_from_mask(lumen: Volume) -> AirwayTree:
     """Make the airway tree of a mask of the lumen, trachea included [Lee1994].
 
     Every point and every step between neighbouring points lies in the lumen, except across the gaps in
     `report.gaps_bridged`.  See `docs/explanation/airway_tree.md`.  Raises AnatomyError if the mask is empty,
-    has no trachea, or is noise.
+    has no trachea, is noise, or is larger than any airway.
     """
+    volume_ml = np.count_nonzero(lumen.array) * lumen.grid.voxel_volume_mm3 / 1000.0
+    if volume_ml > MOST_LUMEN_ML:
+        raise AnatomyError(
+            f"The airway lumen has {volume_ml:.0f} ml",
+            expected=f"an airway, at most {MOST_LUMEN_ML:.0f} ml",
+            remedy="Check the voxel size in the header, and whether the mask is that of the lungs",
+        )
     prepared = prepare_lumen(lumen, max_gap_mm=5.0)
     grid = prepared.grid
     thinned = thin(prepared.solid)

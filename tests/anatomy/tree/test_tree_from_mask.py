@@ -23,6 +23,15 @@ def test_empty_mask_is_refused():
         tree_from_mask(_volume(np.zeros((5, 5, 5), bool)))
 
 
+def test_lungs_as_an_airway_are_refused_before_their_middle_lines_are_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("anatomy.tree.build.thin", pytest.fail)
+    grid = Grid.from_spacing((30, 30, 30), (5.0, 5.0, 5.0), (0.0, 0.0, 0.0))
+    with pytest.raises(AnatomyError, match=r"has 2744 ml.*at most 1000 ml.*that of the lungs"):
+        tree_from_mask(Volume(grid=grid, array=np.pad(np.ones((28, 28, 28), dtype=bool), 1)))
+
+
 def test_single_voxel_is_refused():
     array = np.zeros((5, 5, 5), bool)
     array[2, 2, 2] = True

@@ -7,7 +7,7 @@ the scope's frame; whether it is clear is looked at where the scope is.
 from collections.abc import Iterable
 from dataclasses import asdict
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -40,14 +40,6 @@ class Action(StrEnum):
     NEEDLE = "take another needle path"
     PLACE_AGAIN = "place the scope again"
     STOP = "stop"
-
-
-class Poses(NamedTuple):
-    """Measurements poses `(K, 4, 4)` of each stage, rigid and inside the images."""
-
-    scope: Float
-    tubes: Float
-    needle: Float
 
 
 @frozen_value
@@ -87,14 +79,12 @@ class Measurements:
         }
         return cls(**poses, target_lps=point, placements=placements)
 
-    def poses(self, lung: Lung) -> Poses:
-        """Return the poses as the nearest rigid ones; FrameError or TargetError as `measured_pose`."""
+    def poses(self, lung: Lung) -> tuple[Float, ...]:
+        """Return the poses `(K, 4, 4)` of each stage, as the nearest rigid ones; errors: `measured_pose`."""
         of = {"scope": self.scope, "tube": self.tubes, "needle": self.needle}
-        return Poses(
-            *(
-                np.array([measured_pose(lung, pose, name) for pose in each]).reshape(-1, 4, 4)
-                for name, each in of.items()
-            )
+        return tuple(
+            np.array([measured_pose(lung, pose, name) for pose in each]).reshape(-1, 4, 4)
+            for name, each in of.items()
         )
 
     def record(self) -> dict[str, Any]:

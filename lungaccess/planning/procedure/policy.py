@@ -408,8 +408,8 @@ class Policy:
             SettingsError: If nothing was measured that the procedure decides by.
             FrameError, TargetError: If a pose is not rigid, or a point lies outside the images.
         """
-        procedure, poses = self.procedure, measured.poses(self.lung)
-        if procedure.scope.measured and not len(poses.scope):
+        procedure, (scope, tubes, needle) = self.procedure, measured.poses(self.lung)
+        if procedure.scope.measured and not len(scope):
             raise SettingsError(
                 f"The scope is not measured, which the procedure {procedure.name!r} does",
                 expected="where its tip is",
@@ -418,29 +418,24 @@ class Policy:
         left = max(procedure.scope.placements - measured.placements, 0)
         chosen = self.as_planned(1)
         if procedure.scope.measured:
-            placed = self.scopes_measured(spread.mean_pose(poses.scope)[None], len(poses.scope))
+            placed = self.scopes_measured(spread.mean_pose(scope)[None], len(scope))
             chosen = self.from_scopes(placed)
-        if not len(poses.tubes) and not len(poses.needle):
+        if not len(tubes) and not len(needle):
             return self._decision(chosen, left, tubes_out=False)
         target = self._target[None]
         if measured.target_lps is not None and procedure.imaging.measured:
             target = self.targets_measured((measured.target_lps + self._target - self.plan.target_lps)[None])
-        if len(poses.tubes) and self.plan.needle is not None:
-            tips = self.tips_measured(chosen, spread.mean_pose(poses.tubes)[None], len(poses.tubes))
+        if len(tubes) and self.plan.needle is not None:
+            tips = self.tips_measured(chosen, spread.mean_pose(tubes)[None], len(tubes))
             chosen = self.from_tubes(chosen, tips, target)
-        if not len(poses.needle) or self.plan.needle is None:
+        if not len(needle) or self.plan.needle is None:
             return self._decision(chosen, left, tubes_out=True)
-        return self._on_the_way(chosen, spread.mean_pose(poses.needle), target[0])
+        return self._on_the_way(chosen, spread.mean_pose(needle), target[0])
 
     def _decision(self, chosen: Chosen, left: int, *, tubes_out: bool) -> choices.Decision:
         chance, changed = float(chosen.chances[0]), bool(chosen.changed[0])
-        action = (
-            choices.Action.DEPLOY
-            if chosen.found[0, 0] or (changed and self.plan.needle is None)
-            else choices.Action.NEEDLE
-        )
-        if tubes_out and action is choices.Action.DEPLOY:
-            action = choices.Action.NEEDLE
+        others = bool(chosen.found[0, 0]) or (changed and self.plan.needle is None)
+        action = choices.Action.DEPLOY if others and not tubes_out else choices.Action.NEEDLE
         if not changed:
             action = choices.Action.GO_ON
         if not self.goes_on(chosen.chances, left, tubes_out=tubes_out)[0]:

@@ -14,7 +14,7 @@ import time
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, Unpack
+from typing import Unpack
 
 import numba
 import numpy as np
@@ -49,13 +49,6 @@ ANSWERS = (AnatomyError, PlanFileError, SettingsError, TargetError)
 _one_at_a_time = threading.Lock()
 
 
-class Opened(NamedTuple):
-    """A patient and the check that belongs to it."""
-
-    lung: Lung
-    checker: Checker
-
-
 def answer(run: runs.Run, cache: Path | None = None) -> runs.Answer:
     """Make a run and return what it ended with.
 
@@ -85,13 +78,13 @@ def _here(run: runs.Run, cache: Path | None) -> runs.Answer:
         return _answered(run, _opened(run.problem.patient, cache), cache)
 
 
-def _answered(run: runs.Run, opened: Opened, cache: Path | None) -> runs.Answer:
+def _answered(run: runs.Run, opened: tuple[Lung, Checker], cache: Path | None) -> runs.Answer:
     began, cpu_began = time.perf_counter(), time.process_time()
     try:
         atlas = _atlas_of(run.problem, cache) if run.planner.kind == "plan" else None
         # The atlas belongs to the device and the patient, and its time to no run.
         began, cpu_began = time.perf_counter(), time.process_time()
-        made = needle_answer(run, opened.lung) if atlas is None else _plan_answer(run, opened, atlas)
+        made = needle_answer(run, opened[0]) if atlas is None else _plan_answer(run, *opened, atlas)
     except NoPlan as failure:
         made = runs.Answer(
             key=run.key,
@@ -112,15 +105,15 @@ def _answered(run: runs.Run, opened: Opened, cache: Path | None) -> runs.Answer:
     )
 
 
-def _plan_answer(run: runs.Run, opened: Opened, atlas: Atlas) -> runs.Answer:
+def _plan_answer(run: runs.Run, lung: Lung, checker: Checker, atlas: Atlas) -> runs.Answer:
     """Search for plans and let the best be checked."""
     problem, best = run.problem, None
     improvements: list[runs.Improvement] = []
-    target = point_target(opened.lung, np.array(problem.target_lps), origin=problem.origin)
+    target = point_target(lung, np.array(problem.target_lps), origin=problem.origin)
     began, first_s = time.process_time(), 0.0
     planner = run.planner
     request = Request.of(
-        opened.lung, problem.system, target, goal=planner.goal or problem.objective, errors=problem.errors,
+        lung, problem.system, target, goal=planner.goal or problem.objective, errors=problem.errors,
         procedure=problem.procedure, method=planner.method, needle_planner=planner.needle_planner,
         seed=run.seed, iterations=run.iterations, time_s=problem.time_s,
     )  # fmt: skip
@@ -137,8 +130,8 @@ def _plan_answer(run: runs.Run, opened: Opened, atlas: Atlas) -> runs.Answer:
     if best is None:
         raise NoPlan("The search ended without a plan", reasons={})
     spent = {FIRST_CPU: first_s, SEARCH_CPU: time.process_time() - began}
-    best = replace(best, chance=_chance(run, best, opened.lung), timing={**best.timing, **spent})
-    report = opened.checker.check(best, problem.system, target_lps=target.lps_mm)
+    best = replace(best, chance=_chance(run, best, lung), timing={**best.timing, **spent})
+    report = checker.check(best, problem.system, target_lps=target.lps_mm)
     return runs.Answer(
         key=run.key,
         outcome=runs.PLAN,
@@ -168,9 +161,9 @@ def _chance(run: runs.Run, found: Plan, lung: Lung) -> Chance | None:
 
 
 @lru_cache(maxsize=KEPT_PATIENTS)
-def _opened(patient: runs.Patient, cache: Path | None) -> Opened:
+def _opened(patient: runs.Patient, cache: Path | None) -> tuple[Lung, Checker]:
     lung = runs.open_patient(patient, cache)
-    return Opened(lung, Checker(lung))
+    return lung, Checker(lung)
 
 
 def _atlas_of(problem: runs.Problem, cache: Path | None) -> Atlas:
@@ -180,7 +173,7 @@ def _atlas_of(problem: runs.Problem, cache: Path | None) -> Atlas:
 
 @lru_cache(maxsize=KEPT_PATIENTS)
 def _atlas(patient: runs.Patient, system: System, cache: Path | None, **grid: Unpack[AtlasGrid]) -> Atlas:
-    return open_atlas(_opened(patient, cache).lung, system, cache=cache, **grid)
+    return open_atlas(_opened(patient, cache)[0], system, cache=cache, **grid)
 
 
 def _in_own_process(run: runs.Run, cache: Path | None) -> runs.Answer:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from stages.needle.infeasibility.passage import NOT_BOUNDED, Passage, backward_reach
     from stages.needle.kernels.cost import ObjectiveArrays
     from stages.needle.kernels.proof import Limits, Obstacles
+    from stages.needle.kernels.reach_arcs import DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED
     from stages.needle.objective import DEFAULT, NO_MAP, SHORTEST, TERMS, Objective, Term
     from stages.needle.obstruction import Obstruction, easiest_obstruction, find_obstruction
     from stages.needle.path import (
@@ -49,17 +50,7 @@ if TYPE_CHECKING:
     )
     from stages.needle.planner_choice import has_ompl, require_planner
     from stages.needle.planner_names import NEEDLE_PLANNERS, OMPL_PLANNERS, OMPL_TOLERANCE_MM, OUR_PLANNERS
-    from stages.needle.reach import (
-        BLOCK_MM,
-        DEFAULT_ARCS,
-        DIRECT,
-        NO_CLEARANCE,
-        SEARCHED,
-        UNREACHED,
-        Reached,
-        ReachScan,
-        StartIndex,
-    )
+    from stages.needle.reach import BLOCK_MM, DEFAULT_ARCS, Reached, ReachScan, StartIndex
     from stages.needle.replanning.insertion import Belief, Commands, TrueNeedle, Unknown, steer
     from stages.needle.replanning.replanner import Failure, Replan, Replanner, ReplanSettings
     from stages.needle.search.base import RestartingRRT, Search, first_path

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from anatomy.base.errors import GridMismatchError, SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float, Int, Labels
-from anatomy.fields import CENTRES, SOLID, DistanceField, distance_field
+from anatomy.fields import CENTRES, SOLID, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import EXACT_REACH_MM
 from anatomy.margins import Margins
@@ -58,11 +58,9 @@ def needle_environment(
     may end `goal_tolerance_mm` from the target.
     """
     clearance = lung.obstacle_field(with_fissures=with_fissures)
-    bits = obstacle_bits(with_fissures)
     required = needle.radius_mm + margins.total_mm
-    return _environment(
-        lung.grid, needle, required, clearance, lung.labels, bits, lung.cost, goal_tolerance_mm
-    )
+    obstacles = Obstacles(clearance.corners, lung.labels, clearance.geometry, obstacle_bits(with_fissures))
+    return _environment(lung.grid, needle, required, obstacles, lung.cost, goal_tolerance_mm)
 
 
 def environment_of_labels(
@@ -98,9 +96,8 @@ def environment_of_labels(
     if obstacles_as == SOLID:
         close_border(labels)
     clearance = distance_field("obstacle", (labels & bits) != 0, grid, obstacles_as)
-    return _environment(
-        grid, needle, required_clearance_mm, clearance, read_only(labels), bits, cost_map, goal_tolerance_mm
-    )
+    obstacles = Obstacles(clearance.corners, read_only(labels), clearance.geometry, bits)
+    return _environment(grid, needle, required_clearance_mm, obstacles, cost_map, goal_tolerance_mm)
 
 
 def begun_at_wall(
@@ -134,16 +131,9 @@ ROUNDING_MM = 1e-6
 
 
 def _environment(
-    grid: Grid,
-    needle: Needle,
-    required_mm: float,
-    clearance: DistanceField,
-    labels: Labels,
-    bits: int,
-    cost_map: Volume | None,
-    goal_tolerance_mm: float,
+    grid: Grid, needle: Needle, required_mm: float, obstacles: Obstacles, cost: Volume | None, miss_mm: float
 ) -> NeedleEnvironment:
-    for name, value in (("required clearance", required_mm), ("goal tolerance", goal_tolerance_mm)):
+    for name, value in (("required clearance", required_mm), ("goal tolerance", miss_mm)):
         if not 0.0 <= value < math.inf:
             raise SettingsError(f"The {name} is {value} mm", expected="a finite length of 0 or more")
     limits = Limits(
@@ -156,16 +146,16 @@ def _environment(
         exempt_mm=float(needle.exit_exemption_mm),
         max_step_mm=RRT_STEP_MM,
         cost_step_mm=COST_STEP_MM,
-        goal_tolerance_mm=max(float(goal_tolerance_mm) - ROUNDING_MM, 0.0),
+        goal_tolerance_mm=max(float(miss_mm) - ROUNDING_MM, 0.0),
     )
     return NeedleEnvironment(
         grid=grid,
         needle=needle,
         required_clearance_mm=required_mm,
-        goal_tolerance_mm=goal_tolerance_mm,
-        obstacles=Obstacles(clearance.corners, labels, clearance.geometry, bits),
+        goal_tolerance_mm=miss_mm,
+        obstacles=obstacles,
         limits=limits,
-        cost_map=cost_map,
+        cost_map=cost,
     )
 
 

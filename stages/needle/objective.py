@@ -37,8 +37,7 @@ class Term:
         words: What people call it.
         unit: "" for a pure number, or the unit of the cost map.
         of_map: Whether it is a cost of the map, so that there is none without a map.
-        of_all: Whether it is of all that lies in tissue, the tubes too; other costs are of the needle's path
-            alone.
+        of_all: Whether it is of all that lies in tissue, the tubes too, and not of the needle's path alone.
     """
 
     key: str
@@ -121,14 +120,12 @@ class Objective:
         ``inverse_clearance=1,cost_map=1``.
 
         Raises:
-            SettingsError: If there is no such cost, one is named twice, or a weight is not a number of 0 or
-                more.
+            SettingsError: If there is no such cost, one is named twice, or a weight is no number >= 0.
         """
         if isinstance(stated, Objective):
             return stated
         if stated == DEFAULT:
-            # A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis may lie
-            # nearer.
+            # A mm in a thin vessel costs as much as one at 1 mm from an obstacle: hardly any axis is nearer.
             return cls(inverse_clearance=1.0, cost_map=1.0)
         weights: dict[str, float] = {}
         for part in stated.split(","):

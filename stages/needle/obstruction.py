@@ -27,8 +27,7 @@ class Obstruction:
 
     Args:
         place: "reach": the target lies outside the needle's workspace, whatever the obstacles.  "start":
-            every path is blocked at the beginning.  "target": no needle may end there.  "path": both are
-            free.
+            all paths are blocked at the beginning.  "target": no needle may end there.  "path": neither.
         proved: Whether this alone proves that there is no path.
         label: Of the obstacle voxel that is too near; 0 for "reach".
         point_lps ((3,) float64, LPS mm): The blocked point of the needle's axis: for "path", the tightest
@@ -37,10 +36,8 @@ class Obstruction:
         inserted_mm: Length of the needle there, where it is known.
         distance_mm, needed_mm: From that voxel; None for "reach".
         limit: For "reach": "radius", "angle", "turn" or "length".
-        radius_mm: For "reach": the largest radius of curvature that would reach the target; None if none
-            does.
-        direction_rad, straight_mm: Direction of the target off straight ahead, and its distance from the
-            start.
+        radius_mm: For "reach": the largest radius of curvature that would reach the target, None if none.
+        direction_rad, straight_mm: Direction of the target off straight ahead, and its distance.
     """
 
     place: str
@@ -139,8 +136,7 @@ def _reach(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     tolerance = environment.goal_tolerance_mm
     if far <= tolerance or _reaches(rho, h, limits):
         return None
-    free = limits._replace(max_length_mm=math.inf)
-    if far - tolerance > limits.max_length_mm or _reaches(rho, h, free):
+    if far - tolerance > limits.max_length_mm or _reaches(rho, h, limits._replace(max_length_mm=math.inf)):
         limit = "length"
     elif math.atan2(rho, h) > limits.max_angle_rad:
         limit = "angle"
@@ -164,9 +160,8 @@ def _rules_out(rho: float, h: float, tolerance_mm: float, limit: str, limits: Li
     """Tell whether it is proved that no path ends within the tolerance of a target outside the workspace.
 
     That holds for targets farther than the needle is long; for those behind the start, if paths never turn
-    back; for those that lie in the torus of tightest
-    circles by more than the tolerance, if paths turn by 180 degrees at most; and without a tolerance where
-    the workspace is exact: see "Workspace" in docs/theory/proofs.md.
+    back; for those in the torus of tightest circles by more than the tolerance, if paths turn by 180 degrees
+    at most; and without a tolerance where the workspace is exact: see docs/theory/proofs.md, "Workspace".
     """
     if math.hypot(rho, h) - tolerance_mm > limits.max_length_mm:
         return True
@@ -218,5 +213,4 @@ def _target(environment: NeedleEnvironment, query: Query) -> Obstruction | None:
     _gap, label, distance, needed = exact_gap(environment.obstacles, environment.limits, beyond, x, y, z, -1)
     if distance + environment.goal_tolerance_mm >= needed - kernels.SPARE_MM:
         return None
-    found = np.array([x, y, z, math.nan, distance, needed])
-    return _found("target", True, label, found, query)
+    return _found("target", True, label, np.array([x, y, z, math.nan, distance, needed]), query)

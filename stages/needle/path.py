@@ -32,12 +32,10 @@ class Query:
         branch: Pierced branch, whose wall is exempt at the exit; -1 for none.
         inserted_mm, turned_rad: Length of the needle behind the start and its accumulated turn: the limits
             count both, and so does the exemption at the exit.
-        reference ((3,) float64): Direction from which the limit of the angle counts; by default that of the
-            start.
+        reference ((3,) float64): Direction from which the limit of the angle counts; by default the start's.
 
     Raises:
-        FrameError: If there are not so many finite numbers, the pose is not rigid, or the reference has no
-            length.
+        FrameError: If there are not so many finite numbers, the pose is not rigid, or the reference is 0.
         SettingsError: If the length or the turn behind the start is negative or not finite.
     """
 
@@ -195,15 +193,12 @@ def direct_path(lps_from_start: Float, target: ArrayLike) -> ArcPath:
 def path_from_tree(lps_from_start: Float, nodes: Float, parents: Int, last: int) -> ArcPath:
     """Return the path from the root of a search tree to its node `last`; see `stages.needle.kernels.tree`."""
     chain = []
-    node = last
-    while node != 0:
-        chain.append(node)
-        node = int(parents[node])
-    frame = np.asarray(lps_from_start)
-    arcs = []
+    while last != 0:
+        chain.append(last)
+        last = int(parents[last])
+    frame, arcs = np.asarray(lps_from_start), []
     for node in reversed(chain):
-        length = float(nodes[node, tree.ARC_LENGTH])
-        curvature = float(nodes[node, tree.BEND])
+        length, curvature = float(nodes[node, tree.ARC_LENGTH]), float(nodes[node, tree.BEND])
         roll = frames.roll_towards(frame, nodes[node, tree.BEND + 1 : tree.BEND + 4])
         arcs.append((length, roll, curvature))
         frame = frame @ arc_transform(length, roll, curvature)
@@ -217,10 +212,9 @@ def blocker_on_path(
 
     `branch` is the pierced one, -1 for none, and `inserted_mm` the length of the needle behind the start.
     """
+    obstacles, limits = environment.obstacles, environment.limits
     for pose, bend, length in kernel_arcs(path):
-        label = blocker_on_arc(
-            environment.obstacles, environment.limits, pose, bend, length, inserted_mm, branch
-        )
+        label = blocker_on_arc(obstacles, limits, pose, bend, length, inserted_mm, branch)
         if label:
             return int(label)
         inserted_mm += length
@@ -246,14 +240,13 @@ def violation(
     lengths, curvatures = path.arcs[:, 0], path.arcs[:, 2]
     tolerance = max(goal_tolerance_mm, environment.goal_tolerance_mm)
     turned = query.turned_rad + path.accumulated_turn_rad
+    bent = (curvatures >= 0.0) & (curvatures <= needle.max_curvature_per_mm * (1.0 + SAME_MM))
     # Not a number fails every one of these comparisons.
     tests = {
         "starts elsewhere": np.abs(path.lps_from_start - query.lps_from_start).max() <= SAME_MM,
         "goes backwards": bool((lengths >= 0.0).all()),
         "longer than the needle": query.inserted_mm + path.length_mm <= needle.max_length_mm + SAME_MM,
-        "bends too tightly": bool(
-            ((curvatures >= 0.0) & (curvatures <= needle.max_curvature_per_mm * (1.0 + SAME_MM))).all()
-        ),
+        "bends too tightly": bool(bent.all()),
         "turns too far in all": turned <= math.radians(needle.max_accumulated_turn_deg) + SAME_RAD,
         "points too far from its direction at the start": path.max_angle_from_start_rad(reference)
         <= math.radians(needle.max_angle_from_start_deg) + SAME_RAD,

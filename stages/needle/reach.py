@@ -15,13 +15,6 @@ from stages.needle.search.base import RANDOM_SHARE
 DIRECTION_CELLS = 8
 """Cells along an edge of a cube on whose faces directions are sorted."""
 
-DIRECT, SEARCHED, UNREACHED, NO_CLEARANCE = (
-    reach_arcs.DIRECT,
-    reach_arcs.SEARCHED,
-    reach_arcs.UNREACHED,
-    reach_arcs.NO_CLEARANCE,
-)
-
 
 @frozen_record
 class Reached:
@@ -30,14 +23,11 @@ class Reached:
     Args:
         kinds ((N,) uint8): `DIRECT`: a single arc is proved clear.  `SEARCHED`: a path of several arcs is.
             `UNREACHED`: no single arc is, and the search, if there was one, found nothing.  `NO_CLEARANCE`:
-            no needle can end at the point, because an obstacle that is no airway is nearer than the axis may
-            be.
+            no needle can end at the point: an obstacle that is no airway is nearer than the axis may be.
         cost ((N,) float64): Estimated integral of 1 / clearance of the path found; 0 where there is none.
-        clearance_mm ((N,) float64): Lower bound of its clearance beyond the exempt length; 0 where there is
-            none.
+        clearance_mm ((N,) float64): Lower bound of its clearance beyond the exempt length; else 0.
         entries ((N,) int64): Its start pose; -1 where there is none.
-        window_share ((N,) float64 or None): Share of the breath in which it is proved, where phases of the
-            breath are asked for.
+        window_share ((N,) float64 or None): Share of the breath in which it is proved, if that is asked for.
     """
 
     kinds: UInt8
@@ -148,11 +138,9 @@ class StartIndex:
         self._begins = np.concatenate([[0], changes, [len(keys)]]).astype(np.int64)
         self._positions = np.ascontiguousarray(places[order])
         self._tangents = np.ascontiguousarray(directions[order])
-        bundles = len(self._begins) - 1 if len(keys) else 0
-        self._bounds = np.zeros((bundles, kernel.N_BOUNDS))
-        kernel.bound_bundles(
-            self._positions, self._tangents, np.arange(len(order)), self._begins, self._bounds
-        )
+        self._bounds = np.zeros((len(self._begins) - 1 if len(keys) else 0, kernel.N_BOUNDS))
+        numbers = np.arange(len(order))
+        kernel.bound_bundles(self._positions, self._tangents, numbers, self._begins, self._bounds)
 
     @property
     def count(self) -> int:
@@ -165,8 +153,7 @@ class StartIndex:
         The same as finite entries of `stages.needle.environment.workspace_lengths`, mm; poses at the same
         length come in their own order.
         """
-        found = np.zeros(self.count, dtype=np.int64)
-        lengths = np.zeros(self.count)
+        found, lengths = np.zeros(self.count, dtype=np.int64), np.zeros(self.count)
         count = kernel.workspace_query(
             self._bounds, self._begins, self._order, self._positions, self._tangents,
             np.asarray(target, dtype=np.float64), environment.limits, found, lengths,
@@ -188,7 +175,6 @@ def _keys(positions: Float, directions: Float) -> Int:
     key = key * 6 + axis + 3 * (top < 0.0)
     for other in (1, 2):
         share = 0.5 * (directions[rows, (axis + other) % 3] / np.abs(top) + 1.0)
-        key = key * DIRECTION_CELLS + np.clip(
-            (share * DIRECTION_CELLS).astype(np.int64), 0, DIRECTION_CELLS - 1
-        )
+        place = (share * DIRECTION_CELLS).astype(np.int64)
+        key = key * DIRECTION_CELLS + np.clip(place, 0, DIRECTION_CELLS - 1)
     return np.asarray(key, dtype=np.int64)

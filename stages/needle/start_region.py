@@ -12,7 +12,6 @@ from anatomy.grid import read_only
 from stages.needle.environment import NeedleEnvironment
 from stages.needle.kernels import start_region as proof_kernel
 from stages.needle.kernels import start_trial as kernel
-from stages.needle.kernels.proof import Limits
 from stages.needle.path import CURVATURE, ArcPath, Query, arc_transform, direct_path
 
 KINDS = {
@@ -66,8 +65,7 @@ class ProvedStarts:
     @property
     def volume(self) -> float:
         """Volume of the best pair's poses, mm^3 times steradian."""
-        ball = 4.0 / 3.0 * math.pi * self.offset_mm**3
-        return ball * 2.0 * math.pi * (1.0 - math.cos(self.tilt_rad))
+        return 4.0 / 3.0 * math.pi * self.offset_mm**3 * 2.0 * math.pi * (1.0 - math.cos(self.tilt_rad))
 
 
 @frozen_record
@@ -221,16 +219,13 @@ def prove_starts(environment: NeedleEnvironment, query: Query, path: ArcPath) ->
     The paths end within the environment's goal tolerance, and may go through the corners of the planned one.
     docs/explanation/start_region.md has the theorem.
     """
-    limits, branch = environment.limits, query.branch
     families = [_Family(environment, query, vias) for vias in _vias_of(path)]
-    most = proof_kernel.SEARCHED_MM * max(
-        each.factor(limits, branch, proof_kernel.SEARCHED_MM, 0.0) for each in families
-    )
+    most = proof_kernel.SEARCHED_MM * max(each.factor(proof_kernel.SEARCHED_MM, 0.0) for each in families)
     if not any(each.count for each in families):
         return ProvedStarts(offsets_mm=np.zeros(0), tilts_rad=np.zeros(0), vias=())
     # Offsets for which the largest proved tilt is computed: steps of 4 % of the largest.
     offsets = np.linspace(0.0, most, 25) if most > 0.0 else np.zeros(1)
-    tilts = np.stack([each.largest_tilts(limits, branch, offsets) for each in families])
+    tilts = np.stack([each.largest_tilts(offsets) for each in families])
     chosen = np.argmax(tilts, axis=0)
     kept = np.flatnonzero(tilts.max(axis=0) >= 0.0)
     return ProvedStarts(
@@ -248,9 +243,8 @@ def proved_factor(
     The whole deviation, above 0, is such as three times the errors that are expected.  For many paths this is
     a fast measure of how much they bear: it takes a fraction of `prove_starts`.
     """
-    limits, branch = environment.limits, query.branch
     families = (_Family(environment, query, vias) for vias in _vias_of(path))
-    return max(each.factor(limits, branch, offset_mm, tilt_rad) for each in families)
+    return max(each.factor(offset_mm, tilt_rad) for each in families)
 
 
 class _Family:
@@ -259,27 +253,25 @@ class _Family:
     def __init__(self, environment: NeedleEnvironment, query: Query, vias: Float) -> None:
         frame = query.lps_from_start
         self.points = np.ascontiguousarray(np.vstack([vias, query.target]))
-        self.arcs = np.zeros((len(self.points), proof_kernel.ARC_COLUMNS))
-        self.stations = np.zeros((proof_kernel.MOST_STATIONS, proof_kernel.STATION_COLUMNS))
-        self.count, self.angle = proof_kernel.lay_stations(
+        arcs = np.zeros((len(self.points), proof_kernel.ARC_COLUMNS))
+        stations = np.zeros((proof_kernel.MOST_STATIONS, proof_kernel.STATION_COLUMNS))
+        self.count, angle = proof_kernel.lay_stations(
             environment.obstacles, environment.limits, query.branch,
-            np.concatenate([frame[:3, 3], frame[:3, 2]]), self.points, self.arcs, self.stations,
+            np.concatenate([frame[:3, 3], frame[:3, 2]]), self.points, arcs, stations,
         )  # fmt: skip
+        self._laid = environment.limits, query.branch, arcs, stations, self.count, angle
 
-    def factor(self, limits: Limits, branch: int, offset_mm: float, tilt_rad: float) -> float:
+    def factor(self, offset_mm: float, tilt_rad: float) -> float:
         """Return the largest factor, at most 1, by which offset and tilt are proved together."""
         if not self.count:
             return 0.0
-        args = (limits, branch, self.arcs, self.stations, self.count, self.angle)
-        return float(proof_kernel.largest_factor(*args, offset_mm, tilt_rad))
+        return float(proof_kernel.largest_factor(*self._laid, offset_mm, tilt_rad))
 
-    def largest_tilts(self, limits: Limits, branch: int, offsets: Float) -> Float:
+    def largest_tilts(self, offsets: Float) -> Float:
         """Return the largest proved tilt in rad at each offset, -1 where there is none."""
         tilts = np.full(len(offsets), -1.0)
         if self.count:
-            proof_kernel.largest_tilts(
-                limits, branch, self.arcs, self.stations, self.count, self.angle, offsets, tilts
-            )
+            proof_kernel.largest_tilts(*self._laid, offsets, tilts)
         return tilts
 
 

@@ -162,9 +162,8 @@ class NeedleProblem:
         frames = path.frames()
         for kept in range(len(path.arcs)):
             last = direct_path(frames[kept], query.target)
-            whole = ArcPath(
-                lps_from_start=query.lps_from_start, arcs=np.vstack([path.arcs[:kept], last.arcs])
-            )
+            arcs = np.vstack([path.arcs[:kept], last.arcs])
+            whole = ArcPath(lps_from_start=query.lps_from_start, arcs=arcs)
             allowed = math.isfinite(map_integral(self.environment.cost_map, whole))
             if allowed and not violation(self.environment, query, whole):
                 return whole
@@ -238,11 +237,9 @@ def seed_ompl(seed: int) -> None:
 
 def _termination(time_s: float, iterations: int = NO_LIMIT) -> Any:
     """Return what ends a planner: the time, or so many looks at it, one an iteration of OMPL's planners."""
-    timed = (
-        base.plannerNonTerminatingCondition()
-        if math.isinf(time_s)
-        else base.timedPlannerTerminationCondition(time_s)
-    )
+    timed = base.plannerNonTerminatingCondition()
+    if math.isfinite(time_s):
+        timed = base.timedPlannerTerminationCondition(time_s)
     if iterations >= NO_LIMIT:
         return timed
     looks = count()
@@ -285,19 +282,15 @@ def _limits_of_steps(environment: NeedleEnvironment) -> Limits:
 
 def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
     """Return how OMPL moves a state by a control."""
-    limits = _limits_of_steps(environment)
+    limits, obstacles = _limits_of_steps(environment), environment.obstacles
     costs = environment.cost_map
     forbidden = None if costs is None or np.isfinite(costs.array).all() else costs.array
 
     def propagate(state: Any, u: Any, duration: float, result: Any) -> None:
         """Advance along a share `duration` of an arc that bends towards `u[1]`, if that is proved clear."""
         begin, arc = numbers_of(state), (u[1], u[2], duration * u[0])
-        moved = states.proved_step(
-            environment.obstacles, limits, begin, *arc, question.origin, question.branch
-        )
-        if forbidden is not None and states.is_forbidden(
-            forbidden, environment.obstacles.geometry, begin, *arc
-        ):
+        moved = states.proved_step(obstacles, limits, begin, *arc, question.origin, question.branch)
+        if forbidden is not None and states.is_forbidden(forbidden, obstacles.geometry, begin, *arc):
             moved = (math.nan, math.nan, math.nan, *begin[3:])
         put_numbers(result, moved)
 
@@ -306,14 +299,11 @@ def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[
 
 def validity(environment: NeedleEnvironment, question: Question) -> Callable[[Any], bool]:
     """Return how OMPL tells whether a state is allowed."""
-    limits = _limits_of_steps(environment)
+    limits, obstacles = _limits_of_steps(environment), environment.obstacles
 
     def is_valid(state: Any) -> bool:
         # A numpy.bool_ would raise std::bad_cast.
-        return bool(
-            states.is_allowed(
-                environment.obstacles, limits, numbers_of(state), question.origin, question.branch
-            )
-        )
+        numbers = numbers_of(state)
+        return bool(states.is_allowed(obstacles, limits, numbers, question.origin, question.branch))
 
     return is_valid

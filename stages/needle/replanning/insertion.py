@@ -37,12 +37,10 @@ class Unknown:
     Args:
         start ((6, 6) float64): Covariance of the pose at the start, mm, and rad as a rotation vector, LPS;
             the roll is set from outside, so that its part does not count.
-        factor, factor_ln: Median of the true curvature over the commanded one, and spread of its logarithm; 0
-            if it is known.
+        factor, factor_ln: Median of true over commanded curvature, and spread of its logarithm, 0 if known.
         roll_rad: Of the direction of the bevel each time that it is rolled.
         target_mm: Of the target along each axis.
-        tip_mm, tip_rad, seen_target_mm: Of a measured tip along each axis and about each of two axes, and of
-            a measured target.
+        tip_mm, tip_rad, seen_target_mm: Of a measured tip along each axis and about two, and of a target.
     """
 
     start: Float = field(default_factory=lambda: np.zeros((6, 6)))
@@ -128,8 +126,7 @@ class Belief:
         sine = float(np.linalg.norm(across))
         turn = across * (math.atan2(sine, float(ahead @ seen[:3, 2])) / max(sine, _TINY))
         gap = np.concatenate([seen[:3, 3] - self.frame[:3, 3], axes @ turn])
-        sizes = [self._unknown.tip_mm] * 3 + [self._unknown.tip_rad] * 2
-        noise = np.diag(np.maximum(sizes, LEAST) ** 2)
+        noise = np.diag(np.maximum([self._unknown.tip_mm] * 3 + [self._unknown.tip_rad] * 2, LEAST) ** 2)
         seen_with = looks @ self._covariance
         gain = np.linalg.solve(seen_with @ looks.T + noise, seen_with).T
         # In this form rounding makes no variance negative, however exact a measurement is.
@@ -137,9 +134,8 @@ class Belief:
         self._covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
         self._step(gain @ gap)
         if target is not None:
-            share = self._target_variance / max(
-                self._target_variance + self._unknown.seen_target_mm**2, LEAST**2
-            )
+            variance = self._target_variance
+            share = variance / max(variance + self._unknown.seen_target_mm**2, LEAST**2)
             self.target = self.target + share * (target - self.target)
             self._target_variance *= 1.0 - share
 
@@ -198,15 +194,12 @@ class TrueNeedle:
     Attributes:
         frame: (4, 4) float64.
         inserted_mm: Length of needle from its first start to the tip.
-        arcs (list of (float, float, float)): Length, roll and curvature of all arcs so far, as those of an
-            `ArcPath`.
+        arcs (list of (float, float, float)): Length, roll and curvature of all arcs so far, see `ArcPath`.
     """
 
     def __init__(self, truth: Truth, lps_from_tip: Float, inserted_mm: float) -> None:
-        self._truth = truth
-        self._turned = 0.0
-        self.frame = np.array(lps_from_tip)
-        self.inserted_mm = inserted_mm
+        self._truth, self._turned = truth, 0.0
+        self.frame, self.inserted_mm = np.array(lps_from_tip), inserted_mm
         self.arcs: list[tuple[float, float, float]] = []
         self._frames, self._lengths = [self.frame], [inserted_mm]
 
@@ -247,8 +240,7 @@ class Commands:
 
     def __init__(self, plan: ArcPath, most_per_mm: float) -> None:
         self._arcs, self._most_per_mm = plan.arcs, most_per_mm
-        self._arc = 0
-        self._done_mm = 0.0
+        self._arc, self._done_mm = 0, 0.0
 
     @property
     def finished(self) -> bool:
@@ -274,8 +266,7 @@ class Commands:
             body.insert(length, told)
         self._done_mm += length
         if self.left_mm <= 0.0:
-            self._arc += 1
-            self._done_mm = 0.0
+            self._arc, self._done_mm = self._arc + 1, 0.0
 
     def rest(self, frame: Float) -> ArcPath:
         """Return what is left, from another pose."""
@@ -326,11 +317,9 @@ def steer(
             if path is not None:
                 commands = Commands(path, most_per_mm)
                 continue
-            rest = commands.rest(belief.frame)
-            if blocker_on_path(environment, rest, branch, needle.inserted_mm):
+            if blocker_on_path(environment, commands.rest(belief.frame), branch, needle.inserted_mm):
                 return tuple(replans), replans[-1].failure
         if needle.inserted_mm >= longest_mm - index.MIN_ARC_MM:
             return tuple(replans), Failure.OUT_OF_LENGTH
-        left_mm = min(measure_mm, longest_mm) - needle.inserted_mm
-        commands.give(belief, needle, min(step_mm, left_mm))
+        commands.give(belief, needle, min(step_mm, min(measure_mm, longest_mm) - needle.inserted_mm))
     return tuple(replans), None

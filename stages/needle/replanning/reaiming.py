@@ -112,9 +112,11 @@ class Attempts:
     ) -> None:
         rows = 2 * most_points + 3
         self._environment = environment
-        self._objective = objective
         self._nodes, self._parents = np.zeros((rows, tree.NODE_COLUMNS)), np.zeros(rows, np.int64)
         self._nodes[0] = root_of(root.query)
+        # What the kernels of the tree begin with.
+        branch, nodes, parents = root.query.branch, self._nodes, self._parents
+        self._tree = environment.obstacles, environment.limits, objective, branch, nodes, parents
         self._state = np.array([1], dtype=np.uint64)
         self.root = root
         self.path: ArcPath | None = None
@@ -138,11 +140,8 @@ class Attempts:
             count = self._towards(count, as_point(point))
             if count == 0:
                 return
-        query = self.root.query
-        rows = tree.add_goal(
-            self._environment.obstacles, self._environment.limits, self._objective, query.branch, self._nodes,
-            self._parents, count, count - 1, query.goal, self.wanted, self._state,
-        )  # fmt: skip
+        goal = self.root.query.goal
+        rows = tree.add_goal(*self._tree, count, count - 1, goal, self.wanted, self._state)
         self._keep(count, rows, source)
 
     def by_legs(self) -> None:
@@ -181,19 +180,10 @@ class Attempts:
         return rows if rows > count else 0
 
     def _arc(self, count: int, bend: Bend, length: float, goal: tuple[float, float, float]) -> bool:
-        added = tree.add_arc(
-            self._environment.obstacles, self._environment.limits, self._objective, self.root.query.branch,
-            self._nodes, self._parents, count, count - 1, bend, float(length), goal, self.wanted,
-        )  # fmt: skip
-        return bool(added)
+        return bool(tree.add_arc(*self._tree, count, count - 1, bend, float(length), goal, self.wanted))
 
     def _legs(self, count: int, point: tuple[float, float, float]) -> int:
-        query = self.root.query
-        rows = tree.add_legs(
-            self._environment.obstacles, self._environment.limits, self._objective, query.branch, self._nodes,
-            self._parents, count, count - 1, point, query.goal, self.wanted,
-        )  # fmt: skip
-        return int(rows)
+        return int(tree.add_legs(*self._tree, count, count - 1, point, self.root.query.goal, self.wanted))
 
     def _keep(self, count: int, rows: int, source: Source) -> None:
         if rows > count and self._nodes[rows - 1, tree.PATH_COST] < self.wanted:

@@ -55,10 +55,8 @@ def blocker_at(
     environment: NeedleEnvironment, pose: tuple[float, ...], inserted_mm: float, branch: int
 ) -> int:
     """Return the label that the needle's point at the length `inserted_mm` is too near to, 0 if clear."""
-    straight = (0.0, 1.0, 0.0, 0.0)
-    return int(
-        blocker_on_arc(environment.obstacles, environment.limits, pose, straight, 0.0, inserted_mm, branch)
-    )
+    obstacles, limits, straight = environment.obstacles, environment.limits, (0.0, 1.0, 0.0, 0.0)
+    return int(blocker_on_arc(obstacles, limits, pose, straight, 0.0, inserted_mm, branch))
 
 
 def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, int]:
@@ -67,8 +65,7 @@ def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, 
     reach = environment.required_clearance_mm + EXACT_REACH_MM
     point = as_point(query.lps_from_start[:3, 3])
     in_exit = query.branch >= 0 and query.inserted_mm < environment.limits.exempt_mm
-    spared = query.branch if in_exit else -1
-    distance, label = exact_distance(labels, geometry, *point, bits, spared, reach)
+    distance, label = exact_distance(labels, geometry, *point, bits, query.branch if in_exit else -1, reach)
     if in_exit:
         lumen, lumen_label = exact_distance(labels, geometry, *point, LUMEN, -1, reach)
         if lumen < min(distance, environment.needle.radius_mm):
@@ -214,8 +211,7 @@ class Replanner:
     give the same replans.
 
     Limits count from the needle's first start: length and turn behind the tip, the exemption at the exit,
-    and the angle, which is measured from the first direction.  Raises SettingsError if `iterations` is
-    negative.
+    and the angle, measured from the first direction.  Raises SettingsError if `iterations` is negative.
 
     Args:
         query: What the plan was made for.
@@ -241,16 +237,10 @@ class Replanner:
         """The plan that is being followed; the last replan, if there is one."""
         self.curvature_share = 1.0
         """Share of the needle's largest curvature that it reaches in this tissue: replans keep to it."""
-        self._environment = environment
-        self._query = query
-        self._objective = objective
-        self._objective_arrays = environment.objective_arrays(objective)
-        self._settings = settings
-        self._iterations = iterations
-        self._seed = seed
-        self._replans = 0
-        self._begin_mm = query.inserted_mm
-        self._turned_rad = query.turned_rad
+        self._environment, self._query, self._settings = environment, query, settings
+        self._objective, self._objective_arrays = objective, environment.objective_arrays(objective)
+        self._iterations, self._seed, self._replans = iterations, seed, 0
+        self._begin_mm, self._turned_rad = query.inserted_mm, query.turned_rad
         exact = with_limits(environment, goal_tolerance_mm=0.0)
         self._variants = [exact]
         if settings.curvature_reserve > 0.0:
@@ -263,9 +253,8 @@ class Replanner:
     ) -> Replan:
         """Plan from the pose that the tip is in; a path that is found becomes the plan.
 
-        The pose `(4, 4)` looks along +z, the direction of insertion; the target is `(3,)`, LPS mm.  The
-        length of needle counts from its first start, and so does the turn, by default what the plans so far
-        say.
+        The pose `(4, 4)` looks along +z, the direction of insertion; the target is `(3,)`, LPS mm.  Length
+        of needle and turn count from its first start; the turn is by default what the plans so far say.
 
         Raises:
             FrameError: If pose or target are not finite numbers or the pose is not rigid.
@@ -373,10 +362,8 @@ class Replanner:
         left = limits.max_length_mm - query.inserted_mm
         if left <= index.MIN_ARC_MM:
             return Failure.OUT_OF_LENGTH, f"All of the needle ({limits.max_length_mm:g} mm) is inserted"
-        tolerance = self._environment.goal_tolerance_mm
-        if tolerance == 0.0:
-            at_target = (*query.goal, 0.0, 0.0, 1.0)
-            label = blocker_at(self._environment, at_target, math.inf, -1)
+        if self._environment.goal_tolerance_mm == 0.0:
+            label = blocker_at(self._environment, (*query.goal, 0.0, 0.0, 1.0), math.inf, -1)
             if label:
                 required, name = self._environment.required_clearance_mm, structure_name(label)
                 return Failure.TARGET_BLOCKED, f"The target is nearer than {required:.2f} mm to {name}"
@@ -398,9 +385,8 @@ class Replanner:
         radius = self._environment.needle.radius_mm
         where = f"The axis at the tip is {clearance:.2f} mm from {structure_name(label)}"
         if clearance < radius + MIN_GAP_MM:
-            return Replan(
-                path=None, failure=Failure.TOUCHES, why=f"{where}, the needle's radius is {radius:g} mm"
-            )
+            why = f"{where}, the needle's radius is {radius:g} mm"
+            return Replan(path=None, failure=Failure.TOUCHES, why=why)
         required, longest = self._environment.required_clearance_mm, self._settings.relaxed_mm
         why = f"{where}, and no arc of up to {longest:g} mm leads back to {required:.2f} mm"
         return Replan(path=None, failure=Failure.STUCK, why=why)

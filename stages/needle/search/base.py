@@ -42,10 +42,8 @@ class Search(Protocol):
 def root_of(query: Query) -> Float:
     """Return the root `(NODE_COLUMNS,)` of a tree of arcs, see `stages.needle.kernels.tree`."""
     root = np.zeros(tree.NODE_COLUMNS)
-    root[:3] = query.lps_from_start[:3, 3]
-    root[3:6] = query.lps_from_start[:3, 2]
-    root[tree.PATH_LENGTH] = query.inserted_mm
-    root[tree.PATH_TURN] = query.turned_rad
+    root[:3], root[3:6] = query.lps_from_start[:3, 3], query.lps_from_start[:3, 2]
+    root[tree.PATH_LENGTH], root[tree.PATH_TURN] = query.inserted_mm, query.turned_rad
     if query.reference is not None:
         root[tree.BEND + 1 : tree.BEND + 4] = query.reference
     return root
@@ -75,14 +73,13 @@ def first_path(search: Search, iterations: int, cost_limit: float = math.inf) ->
     return next((path for _used, path in in_slices(search, iterations) if path is not None), None)
 
 
-class TreeSearch:
-    """What the searches that grow a tree share: its arrays, random state and best path."""
+class RestartingRRT:
+    """The RRT of [Kuntz2015], begun anew as [Luby1993] and at each path, then for cheaper ones only."""
 
     def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        self.environment = environment
-        self.query = query
+        self.environment, self.query = environment, query
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False
@@ -93,22 +90,14 @@ class TreeSearch:
         self.nodes, self.parents = np.zeros((MAX_NODES, tree.NODE_COLUMNS)), np.zeros(MAX_NODES, np.int64)
         self.nodes[0] = root_of(query)
         self.count = 1
+        # What the kernels of all searches begin with.
+        self._asked = environment.obstacles, environment.limits, self.objective, query.branch, query.goal
+        self._restarts, self._left = 0, RESTART_ITERATIONS
 
     def take(self, last: int) -> None:
         """Keep the path from the root to the row `last` as the best."""
         self.path = path_from_tree(self.query.lps_from_start, self.nodes, self.parents, last)
         self.cost = float(self.nodes[last, tree.PATH_COST])
-
-
-class RestartingRRT(TreeSearch):
-    """The RRT of [Kuntz2015], begun anew as [Luby1993] and at each path, then for cheaper ones only."""
-
-    def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
-    ) -> None:
-        super().__init__(environment, query, seed=seed, objective=objective)
-        self._restarts = 0
-        self._left = RESTART_ITERATIONS
 
     def advance(self, iterations: int) -> bool:
         """Grow trees; see `Search`.  The tree that found a path is kept until the next call."""
@@ -130,11 +119,10 @@ class RestartingRRT(TreeSearch):
 
     def grow(self, iterations: int) -> tuple[int, int, bool]:
         """Grow the tree; return its rows, the iterations spent, and whether the last row is at the goal."""
-        query = self.query
+        tree_of = self.nodes, self.parents, self.count
         return grow_rrt(  # type: ignore[no-any-return]
-            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
-            self.nodes, self.parents, self.count, iterations, RANDOM_SHARE, self.state, self.cost,
-        )  # fmt: skip
+            *self._asked, *tree_of, iterations, RANDOM_SHARE, self.state, self.cost
+        )
 
 
 def luby(number: int) -> int:

@@ -42,7 +42,7 @@ class Decision:
     """
 
     def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self._asked = (environment, query, objective)
         self.search = PortfolioSearch(environment, query, seed=seed, objective=objective)
@@ -91,12 +91,10 @@ class Decision:
         yield self.search, ENDS_FROM
         if self.path is None:
             self._prove()
-        # The tree goes first: nearly all paths that it finds sooner than the resolution search are found by
-        # then.
+        # The tree goes first: nearly all paths that it finds before the resolution search are found by then.
         yield self.search, 400 - ENDS_FROM
         while True:
-            # Share of the iterations without a path: in narrow passages it is nearly always the first, and so
-            # it is at most a fifth later than alone.
+            # In narrow passages it nearly always finds the first path, at most a fifth later than alone.
             share = (5 / 6) if self.path is None else BETTER_SHARE
             words = 0 if self.resolution.finished else round(share * PIECE)
             yield self.resolution, words
@@ -124,8 +122,7 @@ class Decision:
             return
         # With fewer on a plane, a step takes about a millisecond, and so no thread.
         if self._proof.states < 1000:
-            spent = self.iterations - self._looked
-            self._looked = self.iterations
+            spent, self._looked = self.iterations - self._looked, self.iterations
             # Iterations in which nearly all paths are found.  Until then the proof has about a sixth of the
             # time, and afterwards most of it while it fills cubes.
             self._proof.advance(spent * (CUBES if self.iterations < 1600 else MORE_CUBES))
@@ -152,9 +149,8 @@ class _PlanesInThread:
             self._step = None
         if self._step is not None or self._proof.outcome != "running":
             return self._proof.outcome if self._step is None else "running"
-        # Iterations for a step of the proof on top.
-        # States on a plane of the proof for one iteration of the searches; these take a third of the time
-        # of so many iterations, so that the searches wait only where the proof has no core of its own.
+        # Iterations for a step of the proof, and one more for so many states on a plane; these take a third
+        # of the time of so many iterations: the searches wait only where the proof has no core of its own.
         self._due = iterations + 300 + self._proof.states // 100
         self._step = self._pool.submit(self._proof.advance)
         return "running"

@@ -22,8 +22,7 @@ LAYERS = (12, 14, 16)
 """Numbers of layers of the lattices over all of the space, which are searched one after the other; those
 around a path have one of them, drawn.  A number is given up when its lattices have too many states."""
 CELLS = (1 / 3, 1 / 6)
-"""Sizes of the cells of lattices around a guide path, one after the other, as shares of the largest cell that
-curvature allows."""
+"""Cells of lattices around a guide path, one after the other, as shares of the largest for its curvature."""
 LEAST_GAIN = 0.01
 """A guide path is refined again and again as long as it gains this share of its cost each time."""
 ARCS_PER_BEGINNING = 1 << 16
@@ -39,9 +38,7 @@ Work = tuple[int, bool]
 class GuidePathFinder:
     """Finds guide paths for the searches of a portfolio; the seed is that of how lattices are turned."""
 
-    def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int, objective: Objective
-    ) -> None:
+    def __init__(self, environment: NeedleEnvironment, query: Query, seed: int, objective: Objective) -> None:
         self._lattices = StateLatticeSearch(environment, query, objective)
         self._random = np.random.default_rng(seed)
         self._layers: tuple[int, ...] = LAYERS
@@ -76,8 +73,7 @@ class GuidePathFinder:
         layers = self._layers[int(self._random.integers(len(self._layers)))]
         controls = self._lattices.controls_of(search.path, layers)
         if controls is not None:
-            # A guide path near a path may at first cost so many times as much, since it is not quite that
-            # path.
+            # A guide path near a path may at first cost so many times as much: it is not quite that path.
             yield from self._refine(search, controls, 1.5 * search.cost, best)
 
     def _search_everywhere(self) -> Iterator[Work]:
@@ -132,8 +128,7 @@ class GuidePath:
     """The cheapest path through a state lattice of L layers, if there is one.
 
     Args:
-        controls ((L + 2, 3) float64, LPS mm): Start, control points of a quadratic spline, and target; None
-            if there is no path.
+        controls ((L + 2, 3) float64): Start, control points of a quadratic spline, target; None for no path.
         cost: Cost of the arcs along it, infinite without a path.
         arcs: Arcs that were tried, a measure of the work.
         is_whole: False if the lattice had too many states: then there is no path.
@@ -158,11 +153,10 @@ class StateLatticeSearch:
         self._axis = ahead / max(self._distance, index.MIN_ARC_MM)
         self._cosine = float(self._tangent @ self._axis)
         length = workspace_lengths(environment, self._start[None], self._tangent[None], query.target)[0]
-        self.is_possible = bool(
-            # Least cosine of the angle between a start and the line to the target. From steeper starts, paths
-            # may turn back across the layers.
-            self._distance > index.MIN_ARC_MM and self._cosine > 0.3 and np.isfinite(length)
-        )
+        # The angle between start and line to the target has this cosine at least: from steeper starts, paths
+        # may turn back across the layers.
+        ahead_of_start = self._distance > index.MIN_ARC_MM and self._cosine > 0.3
+        self.is_possible = bool(ahead_of_start and np.isfinite(length))
         """Whether there may be guide paths: the target is in the workspace, and the start not too steep."""
         self._states = np.zeros((MOST_STATES, kernel.STATE_COLUMNS), dtype=np.int64)
         self._before = np.zeros(MOST_STATES, dtype=np.int32)
@@ -173,8 +167,7 @@ class StateLatticeSearch:
     def everywhere(self, layers: int, *, skew: int = 0) -> GuidePath:
         """Return the cheapest guide path anywhere; `skew`, less than SKEWS, turns the lattice.
 
-        More `layers` are finer, and take time by about the 7th power; `skew`, less than SKEWS, turns the
-        lattice.
+        More `layers` are finer, and take time by about the 7th power.
         """
         base, axes, goal_cells = self._straight(layers, skew)
         # No lattice over all of the space has as many cells.
@@ -201,10 +194,7 @@ class StateLatticeSearch:
         slopes[0] = self._tangent / self._cosine
         between = self._distance / layers
         planes = between * np.arange(layers + 1)
-        p, t = (
-            np.stack([np.interp(planes, ahead, column) for column in values.T], axis=1)
-            for values in (points, slopes)
-        )
+        p, t = (np.stack([np.interp(planes, ahead, each) for each in v.T], axis=1) for v in (points, slopes))
         inner = 0.5 * (p[:-1] + p[1:]) + 0.25 * between * (t[:-1] - t[1:])
         inner[0] = self._start + 0.5 * between * t[0]
         return np.concatenate([self._start[None], inner, self._query.target[None]])
@@ -239,14 +229,12 @@ class StateLatticeSearch:
         """Return the axes of a hexagonal lattice across the line to the target, from a direction on."""
         side = side / np.linalg.norm(side)
         up = np.cross(self._axis, side)
-        return np.array(
-            [cell * (math.cos(a) * side + math.sin(a) * up) for a in (turn_rad, turn_rad + math.pi / 3)]
-        )
+        angles = turn_rad, turn_rad + math.pi / 3
+        return np.array([cell * (math.cos(a) * side + math.sin(a) * up) for a in angles])
 
     def _explore(self, base: Float, axes: Float, goal_cells: Float, reach: int, bound: float) -> GuidePath:
         self._table.fill(kernel.NONE)
-        begins = np.zeros(len(base), dtype=np.int64)
-        arrays = (begins, self._states, self._before, self._costs)
+        arrays = (np.zeros(len(base), dtype=np.int64), self._states, self._before, self._costs)
         query = self._query
         arcs, is_whole = kernel.explore(
             self._environment.obstacles, self._environment.limits, self._objective, query.branch, base, axes,

@@ -28,9 +28,9 @@ class OptimalSearch(RestartingRRT):
     """
 
     def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
-        super().__init__(environment, query, seed=seed, objective=objective)
+        super().__init__(environment, query, seed, objective)
         self._vias = np.zeros((MAX_VIAS, optimal.VIA_COLUMNS))
         self._via_count = 0
         self._scratch = np.zeros((2 * MAX_VIAS + 2, tree.NODE_COLUMNS))
@@ -79,11 +79,9 @@ class OptimalSearch(RestartingRRT):
         """Grow by the RRT up to the first path, then in state and cost."""
         if self.path is None:
             return super().grow(iterations)
-        query = self.query
         return optimal.grow_optimal(  # type: ignore[no-any-return]
-            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
-            self.nodes, self.parents, self.count, iterations, self.state, self.cost,
-        )  # fmt: skip
+            *self._asked, self.nodes, self.parents, self.count, iterations, self.state, self.cost
+        )
 
     def _read_vias(self, last: int) -> None:
         """Take the ends of a path's arcs as its via points."""
@@ -103,11 +101,10 @@ class OptimalSearch(RestartingRRT):
     def _refine(self, tries: int) -> bool:
         if not 0 < self._via_count <= MAX_VIAS:
             return False
-        query = self.query
+        count, scratch = self._via_count, (self._scratch, self._scratch_parents)
         self._via_count, cost, improved = optimal.refine(
-            self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
-            self._scratch, self._scratch_parents, self._vias, self._via_count, tries, self.state, self.cost,
-        )  # fmt: skip
+            *self._asked, *scratch, self._vias, count, tries, self.state, self.cost
+        )
         self.iterations += tries
         if not improved:
             return False
@@ -117,13 +114,7 @@ class OptimalSearch(RestartingRRT):
 
     def _build(self, vias: Float, count: int, best: float) -> int:
         """Lay the path through via points into the scratch rows; return the last one, 0 if there is none."""
-        query = self.query
-        return int(
-            optimal.build(
-                self.environment.obstacles, self.environment.limits, self.objective, query.branch, query.goal,
-                self._scratch, self._scratch_parents, vias, count, best,
-            )
-        )  # fmt: skip
+        return int(optimal.build(*self._asked, self._scratch, self._scratch_parents, vias, count, best))
 
     def _keep(self, last: int) -> None:
         """Keep the path in the scratch rows as the best."""

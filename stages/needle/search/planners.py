@@ -17,27 +17,19 @@ MakeSearch = Callable[..., Search]
 """Makes a search for cheap paths of an environment, a query, a seed that repeats it, and an `objective`."""
 
 
-def _makes(
-    cls: type[RestartingRRT] | type[PortfolioSearch] | type[ResolutionSearch] | type[Decision],
-) -> MakeSearch:
-    """Return what makes searches of a class; in the resolution search nothing is random."""
-
-    def make(
-        environment: NeedleEnvironment, query: Query, seed: int, objective: Objective = SHORTEST
-    ) -> Search:
-        if issubclass(cls, ResolutionSearch):
-            return cls(environment, query, objective=objective)
-        return cls(environment, query, seed=seed, objective=objective)
-
-    return make
+def _resolution(
+    environment: NeedleEnvironment, query: Query, seed: int = 1, objective: Objective = SHORTEST
+) -> Search:
+    """Make a resolution search: nothing in it is random."""
+    return ResolutionSearch(environment, query, objective=objective)
 
 
 _OWN: dict[str, MakeSearch] = {
-    "rrt": _makes(RestartingRRT),
-    "ao-rrt": _makes(OptimalSearch),
-    "optimal": _makes(PortfolioSearch),
-    "resolution": _makes(ResolutionSearch),
-    "decide": _makes(Decision),
+    "rrt": RestartingRRT,
+    "ao-rrt": OptimalSearch,
+    "optimal": PortfolioSearch,
+    "resolution": _resolution,
+    "decide": Decision,
 }
 """See docs/explanation/needle.md; `stages.needle.planner_names` states the names for a quick start."""
 

@@ -46,7 +46,7 @@ class PortfolioSearch:
     """
 
     def __init__(
-        self, environment: NeedleEnvironment, query: Query, *, seed: int = 1, objective: Objective = SHORTEST
+        self, environment: NeedleEnvironment, query: Query, seed: int = 1, objective: Objective = SHORTEST
     ) -> None:
         self.path: ArcPath | None = None
         self.cost = math.inf
@@ -64,8 +64,7 @@ class PortfolioSearch:
         """Go on with the search whose turn it is; see `stages.needle.search.base.Search`."""
         left = iterations
         while left > 0:
-            turns = self._next()
-            worker, used, found = turns.advance(left)
+            worker, used, found = self._next().advance(left)
             self.iterations += used
             left -= used
             if found and worker.cost < self.cost:
@@ -88,9 +87,7 @@ class PortfolioSearch:
                 return self._free
             self._patience = self._free.spent
             self._free.spent = 0
-            finder = GuidePathFinder(
-                self._environment, self._query, seed=self._seed, objective=self._objective
-            )
+            finder = GuidePathFinder(self._environment, self._query, self._seed, self._objective)
             self._guided = finder, _Turns(self._guided_turns(finder))
         finder, guided = self._guided
         is_behind = (1.0 - GUIDED_SHARE) * guided.spent <= GUIDED_SHARE * self._free.spent
@@ -114,8 +111,7 @@ class PortfolioSearch:
         while True:
             if self._adopted and self._adopted[1] < best.cost:
                 best.adopt(*self._adopted)
-            searches = [best, *(self._new(FREE) for _ in range(size - 1))]
-            best = yield from self._round(searches, patience)
+            best = yield from self._round([best, *(self._new(FREE) for _ in range(size - 1))], patience)
             size = min(2 * size, LARGEST_SIZE)
 
     def _guided_turns(self, finder: GuidePathFinder) -> "Iterator[Turn]":

@@ -21,7 +21,6 @@ from stages.needle.objective import MAX_CLEARANCE_MM, SHORTEST, Objective
 from stages.needle.path import ArcPath, Query, path_from_tree
 from stages.needle.search.base import root_of
 from stages.needle.search.kernels import resolution as kernel
-from stages.needle.search.kernels import resolution_nodes
 from stages.needle.search.kernels import resolution_nodes as node_kernel
 
 T = TypeVar("T", bound=np.generic)
@@ -51,8 +50,7 @@ class Resolution:
     """The words of a search: pieces of whole steps, in equally spaced directions of bending.
 
     Args:
-        coarse_mm, fine_mm: Length of the longest piece, which is tried first, and of the step, down to which
-            it is halved.
+        coarse_mm, fine_mm: Length of the longest piece, which is tried first, and of the step it is cut to.
         coarse_rolls, fine_rolls: Number of directions of bending that are tried first, and of all.
 
     Raises:
@@ -152,8 +150,7 @@ class ResolutionSearch:
 
     Args:
         query: The directions of bending count from +x of the start pose.
-        duplicates: Poses that count as one; by default only those that are equal up to rounding, so that
-            nothing is lost.
+        duplicates: Poses that count as one; by default only those equal up to rounding: nothing is lost.
         max_memory_mb: The search ends before its arrays take more.
 
     Raises:
@@ -178,8 +175,7 @@ class ResolutionSearch:
                 "The resolution search is asked for an environment whose arcs are looked up, not proved",
                 expected="an environment with a clearance field: the search goes on from what is proved",
             )
-        self.environment = environment
-        self.query = query
+        self.environment, self.query = environment, query
         self.path: ArcPath | None = None
         self.cost = math.inf
         self.finished = False
@@ -197,14 +193,13 @@ class ResolutionSearch:
         self._store = self._first_store()
         left = environment.limits.max_length_mm - query.inserted_mm
         pieces = max(int(left / self.resolution.fine_mm), 0) + 2
-        ranks = pieces * len(self._words[4]) + resolution_nodes.LOOK_AHEAD + 1
-        lists = np.zeros((ranks, 2), dtype=np.int32)
-        lists[:, resolution_nodes.HEAD] = -1
-        entries = np.zeros((FIRST_ENTRIES, resolution_nodes.ENTRY_COLUMNS), dtype=np.int32)
+        lists = np.zeros((pieces * len(self._words[4]) + node_kernel.LOOK_AHEAD + 1, 2), dtype=np.int32)
+        lists[:, node_kernel.HEAD] = -1
+        entries = np.zeros((FIRST_ENTRIES, node_kernel.ENTRY_COLUMNS), dtype=np.int32)
         heap = np.zeros(FIRST_ENTRIES, dtype=np.int32)
         self._queue = np.zeros(FIRST_ENTRIES), entries, np.zeros(FIRST_ENTRIES), heap, lists
-        self._state = np.zeros(resolution_nodes.STATE_SIZE, dtype=np.int64)
-        self._state[resolution_nodes.FREE] = -1
+        self._state = np.zeros(node_kernel.STATE_SIZE, dtype=np.int64)
+        self._state[node_kernel.FREE] = -1
         self._counts = np.zeros(kernel.COUNTS, dtype=np.int64)
         self._counts[kernel.NODES] = 1
         self._best = np.zeros(kernel.BEST_SIZE)
@@ -213,13 +208,10 @@ class ResolutionSearch:
         nodes = np.zeros((FIRST_NODES, node_kernel.NODE_COLUMNS))
         links = np.zeros((FIRST_NODES, node_kernel.LINK_COLUMNS), dtype=np.int32)
         proved = np.zeros((FIRST_NODES, self.resolution.fine_rolls + 1, 2), dtype=np.uint8)
-        start, root = self.query.lps_from_start, nodes[0]
+        query, start, root = self.query, self.query.lps_from_start, nodes[0]
         root[:6] = *start[:3, 3], *start[:3, 2]
         root[node_kernel.NORMAL : node_kernel.NORMAL + 3] = start[:3, 0]
-        root[node_kernel.PATH_LENGTH], root[node_kernel.PATH_TURN] = (
-            self.query.inserted_mm,
-            self.query.turned_rad,
-        )
+        root[node_kernel.PATH_LENGTH], root[node_kernel.PATH_TURN] = query.inserted_mm, query.turned_rad
         links[0] = -1, -1, 0, 0
         proved[0, :, node_kernel.USELESS] = self.resolution.steps + 1
         return nodes, links, proved, np.zeros(4 * FIRST_NODES, dtype=np.int32)
@@ -227,13 +219,8 @@ class ResolutionSearch:
     @property
     def counts(self) -> Counts:
         """What the search has done so far."""
-        return Counts(
-            pops=int(self._counts[kernel.POPS]),
-            nodes=int(self._counts[kernel.NODES]),
-            duplicates=int(self._counts[kernel.DUPLICATES]),
-            pruned=int(self._counts[kernel.PRUNED]),
-            refused=int(self._counts[kernel.REFUSED]),
-        )
+        nodes, pops, duplicates, pruned, refused = self._counts.tolist()
+        return Counts(pops=pops, nodes=nodes, duplicates=duplicates, pruned=pruned, refused=refused)
 
     @property
     def memory_mb(self) -> float:
@@ -252,7 +239,7 @@ class ResolutionSearch:
             )  # fmt: skip
             if reason == kernel.BETTER:
                 self.path = self._best_path()
-                if self._state[resolution_nodes.WAITING] == 0:
+                if self._state[node_kernel.WAITING] == 0:
                     self._end(Outcome.BEST)
                 return True
             if reason == kernel.EXHAUSTED:
@@ -270,8 +257,7 @@ class ResolutionSearch:
         return False
 
     def _end(self, outcome: Outcome) -> None:
-        self.outcome = outcome
-        self.finished = True
+        self.outcome, self.finished = outcome, True
 
     def _may_double(self, arrays: tuple[Array, ...]) -> bool:
         """Tell whether arrays may take twice their memory; end if not."""
@@ -324,29 +310,16 @@ def _doubled(array: NDArray[T]) -> NDArray[T]:
 def _words(resolution: Resolution, kappa: float) -> Words:
     """Return what the kernel has to know of a resolution, see `search_words`; it only reads the arrays."""
     lengths = resolution.fine_mm * np.arange(resolution.steps + 1)
-    arcs = [
-        (
-            arc_kernels.sine_length(kappa, s),
-            arc_kernels.versine_length(kappa, s),
-            math.cos(kappa * s),
-            math.sin(kappa * s),
-        )
-        for s in lengths
-    ]
+    moves = [(arc_kernels.sine_length(kappa, s), arc_kernels.versine_length(kappa, s)) for s in lengths]
+    turns = [(math.cos(kappa * s), math.sin(kappa * s)) for s in lengths]
     rolls = 2.0 * math.pi * np.arange(resolution.fine_rolls) / resolution.fine_rolls
     primitives, first = resolution.primitives()
-    return (
-        resolution.fine_mm,
-        np.stack([np.cos(rolls), np.sin(rolls)], axis=1),
-        np.array(arcs),
-        primitives,
-        first,
-    )
+    directions = np.stack([np.cos(rolls), np.sin(rolls)], axis=1)
+    return resolution.fine_mm, directions, np.hstack([moves, turns]), primitives, first
 
 
 def _rates(objective: ObjectiveArrays, environment: NeedleEnvironment) -> tuple[float, float]:
-    """Return the least cost of a mm, at the largest clearance there is, and what a mm costs that a path ends
-    short."""
+    """Return the least cost of a mm, at the largest clearance there is, and that of a mm of ending short."""
     least = objective.least_rate
     if objective.inverse_clearance == 0.0:
         return least, least

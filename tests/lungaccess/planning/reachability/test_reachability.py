@@ -39,17 +39,10 @@ from lungaccess.plans.assemble import assemble
 from lungaccess.problem.task import Task
 from stages.needle.environment import NeedleEnvironment, direct_arcs, needle_environment
 from stages.needle.kernels import tree
+from stages.needle.kernels.reach_arcs import DIRECT, NO_CLEARANCE, SEARCHED, UNREACHED
 from stages.needle.kernels.reach_search import reach_by_search
 from stages.needle.path import ArcPath, direct_path, path_from_tree
-from stages.needle.reach import (
-    DIRECT,
-    NO_CLEARANCE,
-    RANDOM_SHARE,
-    RRT_ITERATIONS,
-    SEARCHED,
-    UNREACHED,
-    ReachScan,
-)  # fmt: skip
+from stages.needle.reach import RANDOM_SHARE, RRT_ITERATIONS, ReachScan
 from tests.stages.scenes import Canvas
 
 SYSTEM = la.load_system("ultrathin")

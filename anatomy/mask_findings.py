@@ -48,6 +48,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     yield from _of_lungs(lung, {"vessels": vessels, "fissures": everywhere}, images.grid, tree)
     yield "lungs_l", _count(lung) * ml / 1000.0
     yield "lumen_ml", _count(lumen) * ml
+    yield "lumen_end_mm2", _lowest_mm2(lumen, images.grid)
     yield "lumen_holes", tree.report.cavity_voxels / _count(lumen)
     yield from _of_airway(lung, images.grid, tree)
     inside = vessels & lung
@@ -72,6 +73,10 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         if len(sheet):
             # Fissures that end as near to the surface of the lungs reach it.
             yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, 3.0)).any(1).mean())
+            # So far off a sheet is left in some direction, as it is drawn two voxels thick.
+            beside_mm = max(2.5, 1.5 * float(images.grid.spacing_mm.max()))
+            thick = _around(fissures, images.grid, sheet, beside_mm).all(1)
+            yield "fissures_thick", float(thick.mean())
         yield "fissures_in_others", _count(fissures & (vessels | lumen)) / _count(fissures)
     if images.nodules is not None:
         nodules = images.nodules.array
@@ -95,6 +100,14 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
 def _count(mask: Mask) -> float:
     """Return how many voxels a mask has, at least one."""
     return float(max(int(np.count_nonzero(mask)), 1))
+
+
+def _lowest_mm2(mask: Mask, grid: Grid) -> float:
+    """Return the area of the slice of a mask that lies farthest down."""
+    axis = int(np.abs(grid.lps_from_ijk[2, :3]).argmax())
+    low, high = morphology.bounds(mask)
+    last = low[axis] if grid.lps_from_ijk[2, axis] > 0.0 else high[axis] - 1
+    return np.count_nonzero(mask.take(last, axis)) * grid.voxel_volume_mm3 / float(grid.spacing_mm[axis])
 
 
 def _shared(one: Mask, other: Mask) -> float:

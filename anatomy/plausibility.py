@@ -126,6 +126,12 @@ LIMITS: Mapping[str, Limit] = {
         check="airway", words="The airway lumen has {}", form="{:.1f} ml", usual=(8, 200),
         possible=(2, 500), reason="20 to 120 ml are seen in CT; a child of one year has 5 ml",
     ),
+    "lumen_end_mm2": Limit(
+        check="airway", words="The airway ends below with {} of lumen in one slice", form="{:.0f} mm2",
+        usual=(0, 30), possible=(0, MOST), reason="the lowest bronchus of phantoms ends with 2 to 8 mm2; "
+        "where a mask or an image is cut there are 60 and more", remedy="Look whether the mask of the "
+        "airway goes on: what lies behind its end is not reached",
+    ),
     "lumen_holes": Limit(
         check="airway", words="Holes in the lumen take {} of it", usual=(0, 0.02), possible=(0, 0.2),
         reason="a lumen has none, a wall has its lumen",
@@ -209,6 +215,11 @@ LIMITS: Mapping[str, Limit] = {
         check="fissures", words="The part of the lungs with the fewest fissures has {} of their mean "
         "share", usual=(0.1, 1), reason="of three parts of each lung, from apex to base, the oblique "
         "fissure crosses all", remedy="Look whether fissures are missing there: none is avoided",
+    ),
+    "fissures_thick": Limit(
+        check="fissures", words="{} of the fissures are thick", usual=(0, 0.005), reason="they are thin "
+        "sheets; of large vessels 9 % are thick", remedy="Look whether the masks of fissures and vessels "
+        "are exchanged",
     ),
     "fissures_in_others": Limit(
         check="overlap", words="{} of the fissures lie in vessels or airway", usual=(0, 0.2),

@@ -174,6 +174,20 @@ def test_slices_at_twice_their_distance_are_told(whole: Checked, tmp_path: Path)
     assert [each.verdict for each in found.findings if "times as tall" in each.found] == [DOUBTFUL]
 
 
+def test_an_airway_that_is_cut_below_is_told(whole: Checked) -> None:
+    lumen = whole.images.lumen
+    kept = lumen.array.copy()
+    kept[:, :, : kept.shape[2] // 3] = False
+    cut = replace(lumen, array=kept)
+    findings = mask_findings(replace(whole.images, lumen=cut), tree_from_mask(cut), whole.points)
+    assert [each.verdict for each in findings if "ends below" in each.found] == [DOUBTFUL]
+
+
+def test_vessels_in_the_place_of_fissures_are_told(whole: Checked) -> None:
+    findings = mask_findings(replace(whole.images, fissures=whole.images.vessels), whole.tree, whole.points)
+    assert [each.verdict for each in findings if "fissures are thick" in each.found] == [DOUBTFUL]
+
+
 def test_two_nodules_of_one_label_are_told(whole: Checked) -> None:
     nodules = whole.images.nodules
     assert nodules is not None

@@ -96,7 +96,14 @@ def ompls_benchmark(problem: NeedleProblem, log: Path | None = None) -> list[flo
     bench = tools.Benchmark(problem.setup, "needle")
     bench.addPlanner(problem.planners()["rrt"](problem.si))
     bench.benchmark(
-        tools.Request(maxTime=LONG_S, maxMem=1e5, runCount=3, displayProgress=False, simplify=False)
+        tools.Request(
+            maxTime=LONG_S,
+            maxMem=1e5,
+            runCount=3,
+            displayProgress=False,
+            simplify=False,
+            saveConsoleOutput=False,
+        )  # fmt: skip
     )
     if log is not None:
         bench.saveResultsToFile(str(log))

@@ -1,8 +1,7 @@
-"""A search as pictures and a table: best cost over time, and its devices by what is made large."""
+"""A search as pictures: its best cost over time, and its devices by what is made large."""
 
 from __future__ import annotations
 
-import csv
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -11,10 +10,9 @@ from pathlib import Path
 from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter
 
-from anatomy.base.files import atomic_write
-from anatomy.base.records import frozen_value
 from lungaccess.problem.goals import Goal
 from lungaccess.showing.report import drawing, style
+from lungaccess.showing.report.cost_history import CostPoint
 
 
 @style.plain_look
@@ -64,34 +62,6 @@ def _note(axes: Axes, x: float, y: float, text: str, shift: tuple[float, float],
         text, (x, y), xytext=shift, textcoords="offset points", ha=side, va="bottom",
         fontsize=9, color=style.INK, path_effects=drawing.halo(3),
     )  # fmt: skip
-
-
-@frozen_value
-class CostPoint:
-    """The state of a search at one moment.
-
-    Args:
-        elapsed_s: Planning time since the search began.
-        best: Value of the goal for the best plan yet, in its unit; None before the first plan.
-    """
-
-    elapsed_s: float
-    iteration: int
-    best: float | None
-
-
-def cost_over_time_csv(history: Sequence[CostPoint], path: str | os.PathLike[str]) -> Path:
-    """Write one line a point: elapsed_s, iteration, best (empty before the first plan).
-
-    Raises FileError if the file cannot be written.
-    """
-    with atomic_write(Path(path)) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["elapsed_s", "iteration", "best"])
-        for point in history:
-            best = "" if point.best is None else repr(float(point.best))
-            writer.writerow([f"{point.elapsed_s:.6f}", point.iteration, best])
-    return Path(path)
 
 
 @style.plain_look

@@ -73,7 +73,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
         if len(sheet):
             # Fissures that end as near to the surface of the lungs reach it.
             yield "fissures_at_rim", float((~_around(lung, images.grid, sheet, 3.0)).any(1).mean())
-            # So far off a sheet is left in some direction, as it is drawn two voxels thick.
+            # A sheet, which is drawn two voxels thick, ends within this distance in some direction.
             beside_mm = max(2.5, 1.5 * float(images.grid.spacing_mm.max()))
             thick = _around(fissures, images.grid, sheet, beside_mm).all(1)
             yield "fissures_thick", float(thick.mean())

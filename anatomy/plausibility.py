@@ -128,8 +128,8 @@ LIMITS: Mapping[str, Limit] = {
     ),
     "lumen_end_mm2": Limit(
         check="airway", words="The airway ends below with {} of lumen in one slice", form="{:.0f} mm2",
-        usual=(0, 30), possible=(0, MOST), reason="the lowest bronchus of phantoms ends with 2 to 8 mm2; "
-        "where a mask or an image is cut there are 60 and more", remedy="Look whether the mask of the "
+        usual=(0, 30), possible=(0, MOST), reason="the lowest bronchus of phantoms ends with 3 to 8 mm2; "
+        "where their masks are cut in the lungs there are 60 and more", remedy="Look whether the mask of the "
         "airway goes on: what lies behind its end is not reached",
     ),
     "lumen_holes": Limit(
@@ -218,8 +218,8 @@ LIMITS: Mapping[str, Limit] = {
     ),
     "fissures_thick": Limit(
         check="fissures", words="{} of the fissures are thick", usual=(0, 0.005), reason="they are thin "
-        "sheets; of large vessels 9 % are thick", remedy="Look whether the masks of fissures and vessels "
-        "are exchanged",
+        "sheets; of the vessels of phantoms 9 % are thick", remedy="Look whether the masks of fissures "
+        "and vessels are exchanged",
     ),
     "fissures_in_others": Limit(
         check="overlap", words="{} of the fissures lie in vessels or airway", usual=(0, 0.2),

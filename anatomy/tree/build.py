@@ -25,7 +25,7 @@ from anatomy.tree.voxel_tree import (
 
 MOST_LUMEN_ML = 1000.0
 """A lumen of more millilitres is no airway: those of adults have 20 to 200, and lungs have litres.  To find
-middle lines of lungs takes many minutes."""
+middle lines of lungs takes many minutes; the check of masks comes later and refuses from 500 ml on."""
 
 
 def tree_from_mask(lumen: Volume) -> AirwayTree:

@@ -182,7 +182,13 @@ class RestingShaft:
         )
 
     def _followed(
-        self, motion: ScopeMotion, shaft: kernel.Shaft, entry: Float, bends: Float, pull: Float, laid: Float
+        self,
+        motion: ScopeMotion,
+        shaft: kernel.Shaft,
+        entry: Float,
+        curvature: Float,
+        pull: Float,
+        laid: Float,
     ) -> float:
         """Return how far the hand follows until nothing holds the tip of a shaft that is too long as laid."""
         # The tip is held so stiffly at its depth while the shaft settles at first, lest it leaves its branch.
@@ -192,7 +198,7 @@ class RestingShaft:
             entry[9:] = motion.lps_from_entry[:3, 3] + farther * entry[6:9]
             drawn = _drawn_back(held, farther)
             # While the tip is held, a step is worth at least this.
-            kernel.bring_to_rest(self._lumen, drawn, entry, bends, pull, laid, 1e-4, MOST_STEPS)
+            kernel.bring_to_rest(self._lumen, drawn, entry, curvature, pull, laid, 1e-4, MOST_STEPS)
             beyond = float((laid[-1, 9:] - held.tip) @ held.ahead)
             # The hand has followed where the tip moves the spring by less than this: a force of 0.01 N.
             if abs(beyond) < 0.01:

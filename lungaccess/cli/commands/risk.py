@@ -80,7 +80,7 @@ def risk(
     if planned is not None and planned.procedure != followed.name:
         terminal.say(
             f"It was planned for '{planned.procedure}', with which {of_hundred(planned.share)} of 100 were "
-            f"counted; --procedure {planned.procedure} simulates that anew"
+            f"counted: state it as --procedure to simulate it anew"
         )
     terminal.show(
         [_outcome_table(report), _sensitivity_table(report), _tolerance_table(kept), _resting_table(rested)]

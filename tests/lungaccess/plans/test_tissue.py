@@ -166,7 +166,7 @@ def test_a_plan_for_success_counts_tissue(
     assert main(["risk", str(tmp_path / "plan.json"), "patient", "--samples", "200"]) == ExitCode.OK
     said = " ".join(capsys.readouterr().out.split())
     assert "It was planned for 'measured-tip'" in said
-    assert "--procedure measured-tip simulates that anew" in said
+    assert "state it as --procedure to simulate it anew" in said
 
 
 def test_risk_with_another_tool_says_what_counts(

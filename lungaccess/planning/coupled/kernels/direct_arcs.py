@@ -14,6 +14,8 @@ from stages.needle.kernels import CLEARANCE_FLOOR_MM, blocker_on_arc, cost_of_ar
 
 PRUNED_BY_BOUND = -2
 """The label of an arc that was not tested for obstacles, because its cost or its lower bound is too high."""
+SHORTEST_MM = 1e-6
+"""A shorter needle is none: the tubes end at the target, and rounding would decide where it goes."""
 
 # Typed: a kernel is compiled once more for every literal that it is called with.
 _FIRST = np.bool_(True)
@@ -64,7 +66,7 @@ def evaluate_arcs(needle, positions, tangents, branches, before, target, slack, 
         slack, best (float): Arcs that cost more than `slack` times the cheapest so far, at first `best`, are
             not tested.
         blockers ((N,) int64): Receives 0 for arcs that are proved clear, the label that blocks, -1 where no
-            arc keeps the needle's limits, or PRUNED_BY_BOUND.
+            arc keeps the needle's limits or none is needed, or PRUNED_BY_BOUND.
         costs ((N,) float64): Receives estimated costs with those of the tubes, infinite where a lower bound
             was enough.
 
@@ -79,7 +81,7 @@ def evaluate_arcs(needle, positions, tangents, branches, before, target, slack, 
         pose = (x, y, z, tx, ty, tz)
         length, bend, turn = arc_to_point(pose, target)
         costs[n] = math.inf
-        if single_arc_exceeds(limits, bend, length, turn):
+        if length < SHORTEST_MM or single_arc_exceeds(limits, bend, length, turn):
             blockers[n] = -1
             continue
         bound = before[n] + _cost_bound(needle, _clearance_bound(needle, x, y, z), end, length)

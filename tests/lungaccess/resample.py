@@ -17,6 +17,8 @@ from tests.stages.scenes import brute_clearance
 STEP_MM = 0.02
 CORNER_MM = 0.06
 """In the airway the axis may cut the corner of a voxel of wall for less than this."""
+REACH_MM = 4.0
+"""No device with its margins and the sweep of its tubes needs as much room."""
 
 
 @dataclass
@@ -89,12 +91,12 @@ def forbidden(plan: Plan) -> int:
 
 
 def clearance(lung: Lung, points: Float, bits: int, exempt_branch: int = -1) -> Float:
-    return brute_clearance(lung.labels, lung.grid, points, bits, 2.5, exempt_branch)
+    return brute_clearance(lung.labels, lung.grid, points, bits, REACH_MM, exempt_branch)
 
 
 def problems(plan: Plan, lung: Lung) -> list[str]:
     """Say in what a plan breaks the rules, walked again in steps of 0.02 mm."""
-    return [*_scope(plan, lung), *_tubes(plan, lung), *_needle(plan, lung)]
+    return [*_scope(plan, lung), *_tubes(plan, lung), *([] if plan.needle is None else _needle(plan, lung))]
 
 
 def _scope(plan: Plan, lung: Lung) -> list[str]:
@@ -125,7 +127,7 @@ def _tubes(plan: Plan, lung: Lung) -> list[str]:
     walk, out, system = tube_walk(plan), [], plan.system
     if np.abs(walk.frames[-1] - plan.tube.lps_from_tip).max() > 1e-6:
         out.append("the tube tip is elsewhere")
-    if not np.allclose(plan.needle.lps_from_start, plan.tube.lps_from_tip):
+    if plan.needle is not None and not np.allclose(plan.needle.lps_from_start, plan.tube.lps_from_tip):
         out.append("the needle does not start at the tube tip")
     behind = walk.s > plan.tube.exit.arc_length_mm
     before = walk.s < plan.tube.exit.arc_length_mm - 0.2
@@ -133,7 +135,7 @@ def _tubes(plan: Plan, lung: Lung) -> list[str]:
         out.append("the tube leaves the lumen before its exit")
     radius = np.where(
         walk.s[behind] <= plan.tube.outer_insertion_mm - 1e-9,
-        system.tubes.outer.outer_diameter_mm / 2,
+        system.tubes.nested[-1].outer_diameter_mm / 2,
         system.tubes.inner.outer_diameter_mm / 2,
     )
     needed = radius + system.margins.total_mm + plan.tube.lateral_sweep_mm

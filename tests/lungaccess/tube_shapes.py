@@ -31,7 +31,8 @@ def shared_curvatures(system: System) -> tuple[float, float]:
     Those that lie in each other share it by their stiffness, a needle that is deployed with them, too.
     """
     tubes, needle = system.tubes, system.needle
-    inner, outer = (_stiffness(tube, tube.outer_diameter_mm) for tube in tubes.nested)
+    inner, *around = (_stiffness(tube, tube.outer_diameter_mm) for tube in tubes.nested)
+    outer = sum(around)
     carried = needle is not None and system.needle_preloaded
     within = _stiffness(needle, needle.diameter_mm) if carried else 0.0
     kappa = tubes.inner.precurvature_per_mm

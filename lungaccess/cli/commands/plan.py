@@ -271,6 +271,11 @@ def alternatives(
     _show(lung, found, appraisals)
     if found[0].plan.system_choice:
         terminal.say(" ".join(found[0].plan.system_choice))
+    if len(found) < count:
+        terminal.say(
+            f"{len(found)} of at most {count} plans: no further direct way was proved whose needle lies "
+            f"somewhere {separation:g} mm from these (--separation)"
+        )
     terminal.say(f"Written to {out}; the check refuses {refused} of {len(found)}")
     return ExitCode.of(not refused)
 

@@ -194,11 +194,19 @@ def test_an_atlas_serves_another_needle(small_lung: Lung, atlas: la.Atlas) -> No
 
 
 @pytest.mark.slow
-def test_command(small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command(
+    small_lung: Lung, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("lungaccess.cli.options.load_lung", lambda *_: small_lung)
-    words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
-    words += ["--procedure", "open-loop", "--iterations", "2"]
-    assert cli.main([*words, "--out", str(tmp_path / "plans"), "--cache", str(tmp_path)]) == 0
-    saved = sorted(path.name for path in (tmp_path / "plans").iterdir())
-    assert saved == ["plan-01.json", "plan-02.json", "trade_off.svg"]
+
+    def files_of(name: str, separation_mm: str) -> list[str]:
+        words = ["alternatives", "patient", "--nodule", "1", "--system", "ultrathin", "--count", "2"]
+        words += ["--procedure", "open-loop", "--iterations", "2", "--separation", separation_mm]
+        assert cli.main([*words, "--out", str(tmp_path / name), "--cache", str(tmp_path)]) == 0
+        return sorted(path.name for path in (tmp_path / name).iterdir() if path.is_file())
+
+    assert files_of("plans", "2") == ["plan-01.json", "plan-02.json", "trade_off.svg"]
     assert la.check(la.Plan.load(tmp_path / "plans" / "plan-01.json"), small_lung).accepted
+    assert "of at most" not in capsys.readouterr().out
+    assert "plan-02.json" not in files_of("far", "200")
+    assert "1 of at most 2 plans: no further direct way" in " ".join(capsys.readouterr().out.split())

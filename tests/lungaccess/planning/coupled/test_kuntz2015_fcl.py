@@ -47,9 +47,9 @@ from stages.tube import Deployment, DeploymentValidator, TubeShape, design_array
 from tests.lungaccess.planning.coupled.planning import SYSTEM
 from tests.lungaccess.resample import problems
 
-EASY_TARGET = "lps:-56.3,53.9,-48.5"
-"""One that the first two thousand random placements reach several times."""
-ITERATIONS = 2000
+EASY_TARGET = "lps:69.7,21.8,-72.6"
+"""One that the first twenty thousand random placements reach several times."""
+ITERATIONS = 20_000
 SPACING_MM = np.array([0.55, 0.6, 0.7])
 
 
@@ -102,7 +102,8 @@ class TestPlans:
     ) -> None:
         found = plans["once"]
         costs = [plan.costs["inverse_clearance"] for plan in found]
-        assert len(found) >= 2 and all(b < a for a, b in zip(costs[:-1], costs[1:], strict=True))
+        # The last is the best once more, by the simplest motion of the scope.
+        assert len(found) >= 2 and costs == sorted(costs, reverse=True) and costs[-1] == costs[-2]
         for plan in found:
             assert plan.method == "reference"
             report = la.check(plan, small_lung, SYSTEM)

@@ -30,7 +30,7 @@ MOST = 200
 def searches() -> list[AtlasSearch]:
     """Searches in an atlas with wide gaps."""
     lung = build_lung(make_phantom(seed=1, size="small").images)
-    atlas = la.build_atlas(lung, SYSTEM, rotations=3, stop_spacing_mm=12.0, site_spacing_mm=8.0)
+    atlas = la.build_atlas(lung, SYSTEM, rotations=4, stop_spacing_mm=8.0, site_spacing_mm=8.0)
     return [
         AtlasSearch(Task(lung=lung, system=SYSTEM, target=point_target(lung, point), seed=seed), atlas)
         for seed, point in enumerate(peripheral_targets(lung, 16, 3))

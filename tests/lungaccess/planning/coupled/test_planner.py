@@ -244,6 +244,6 @@ class TestProcesses:
         assert costs[-1] <= alone[-1].costs["inverse_clearance"]
 
     def test_bad_numbers(self, small_lung: Lung, target: Target, atlas: la.Atlas) -> None:
-        for options in ({"processes": 0}, {"processes": -2}, {"processes": 2, "method": "kuntz2015"}):
+        for options in ({"processes": 0}, {"processes": -2}):
             with pytest.raises(SettingsError, match="processes"):
                 plans_of(small_lung, target, atlas, **options)

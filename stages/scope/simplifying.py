@@ -1,9 +1,11 @@
 """Motions of few changes: from a proved motion to one of fewer, longer legs that ends in the same pose."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,6 +85,18 @@ def legs_of(motion: ScopeMotion) -> Legs:
     return Legs(np.arange(len(rows)), twist, bend, advance_mm[:-1])
 
 
+class Removal(NamedTuple):
+    """A change less of legs: how much it changes before it is fitted, in rad, and how its legs are made.
+
+    `joins` tells whether it takes a leg, `ties` whether it takes a twist.
+    """
+
+    damage: float
+    made: Callable[[], Legs]
+    joins: bool = False
+    ties: bool = False
+
+
 class Simplifier:
     """Looks for motions of fewer changes and twists to the end of a proved one, with room of `room_mm`.
 
@@ -119,14 +133,13 @@ class Simplifier:
         least, tries = 0.0, 0
         removed = False
         while tries < MOST_TRIES:
-            moves = [(damage, n, move) for n, (damage, move) in enumerate(self._removals(legs))]
-            for damage, _, move in sorted(moves, key=lambda each: each[:2]):
-                if damage < least or tries >= MOST_TRIES:
+            for move in sorted(self._removals(legs), key=lambda each: each.damage):
+                if move.damage < least or tries >= MOST_TRIES:
                     continue
                 tries += 1
-                found = self._fitted(move)
+                found = self._fitted(move.made())
                 if found is not None:
-                    legs, least, removed = found, damage, True
+                    legs, least, removed = found, move.damage, True
                     break
             else:
                 if not removed:
@@ -157,58 +170,59 @@ class Simplifier:
     def _reduced(self, legs: Legs, count: int, twists: int) -> Legs:
         """Return legs of which the least important are removed until there are so few."""
         while legs.count > count or len(legs.twists) > twists:
-            moves = [
-                (damage, n, move)
-                for n, (damage, move) in enumerate(self._removals(legs))
-                if (move.count < legs.count and legs.count > count)
-                or (len(move.twists) < len(legs.twists) and len(legs.twists) > twists)
-            ]
-            legs = min(moves, key=lambda each: each[:2])[2]
+            long, turned = legs.count > count, len(legs.twists) > twists
+            moves = (each for each in self._removals(legs) if each.joins and long or each.ties and turned)
+            legs = min(moves, key=lambda each: each.damage).made()
         return legs
 
-    def _removals(self, legs: Legs) -> Iterator[tuple[float, Legs]]:
-        """Yield legs with a change less, each with how much that changes before it is fitted, rad."""
+    def _removals(self, legs: Legs) -> Iterator[Removal]:
+        """Yield what could be removed of legs: a twist, a leg, or the bend at the begin or at the end."""
         rows = legs.rows
         lengths = np.append(legs.advances, self._device.length)
         ways = np.stack([np.cos(rows[:, 0]), np.sin(rows[:, 0])], axis=1)
         vectors = rows[:, 1:2] / self._device.length * ways
+        turned = np.linalg.norm(vectors, axis=1) * lengths
         for group in range(len(legs.twists) - 1):
-            yield self._tied(legs, group, vectors, lengths)
+            yield self._tied(legs, group, vectors, lengths, turned)
         for leg in range(legs.count - 1):
             yield self._joined(legs, leg, vectors, lengths)
         if legs.bends[0] != 0.0 and legs.count > 1:
             bends = legs.bends.copy()
             bends[0] = 0.0
-            yield float(abs(rows[0, 1]) * lengths[0] / self._device.length), replace(legs, bends=bends)
+            damage = float(abs(rows[0, 1]) * lengths[0] / self._device.length)
+            yield Removal(damage, partial(replace, legs, bends=bends))
         if len(legs.bends) > legs.count:
             bends = legs.bends[:-1].copy()
             change = abs(bends[-1] - legs.bends[-1])
             if self._end[0] <= bends[-1] <= self._end[1]:
-                yield float(change), replace(legs, bends=bends)
+                yield Removal(float(change), partial(replace, legs, bends=bends))
 
-    def _tied(self, legs: Legs, group: int, vectors: Float, lengths: Float) -> tuple[float, Legs]:
+    def _tied(self, legs: Legs, group: int, vectors: Float, lengths: Float, turned: Float) -> Removal:
         """Return legs with one twist for two groups of them."""
-        first, second = legs.group == group, legs.group == group + 1
-        both = first | second
+        begin, middle, end = np.searchsorted(legs.group, (group, group + 1, group + 2)).tolist()
         one, other = float(legs.twists[group]), float(legs.twists[group + 1])
-        turned = np.linalg.norm(vectors, axis=1) * lengths
-        weights = [float(turned[each].sum()) + 1e-12 for each in (first, second)]
+        weights = [float(turned[begin:middle].sum()) + 1e-12, float(turned[middle:end].sum()) + 1e-12]
         # A section bent the other way, half a turn on, is the same.
-        near = one + math.pi * np.round((other - one) / math.pi)
+        near = one + math.pi * round((other - one) / math.pi)
         twist = (weights[0] * one + weights[1] * near) / sum(weights)
         if group + 2 == len(legs.twists):
             twist += other - near
-        twist = float(np.clip(twist, -MOST_TWIST_RAD, MOST_TWIST_RAD))
-        along = vectors @ [math.cos(twist), math.sin(twist)]
-        bends = np.where(both, along * self._device.length, legs.rows[:, 1])
-        across = np.linalg.norm(vectors - along[:, None] * [math.cos(twist), math.sin(twist)], axis=1)
-        twists = np.delete(legs.twists, group + 1)
-        twists[group] = twist
-        groups = legs.group - (legs.group > group)
-        tied = replace(legs, group=groups, twists=twists, bends=bends[: len(legs.bends)])
-        return float((across * lengths)[both].sum()), tied
+        twist = min(max(twist, -MOST_TWIST_RAD), MOST_TWIST_RAD)
+        way = np.array([math.cos(twist), math.sin(twist)])
+        along = vectors @ way
+        across = np.linalg.norm(vectors - along[:, None] * way, axis=1)
 
-    def _joined(self, legs: Legs, leg: int, vectors: Float, lengths: Float) -> tuple[float, Legs]:
+        def made() -> Legs:
+            bends = legs.rows[:, 1]
+            bends[begin:end] = along[begin:end] * self._device.length
+            twists = np.delete(legs.twists, group + 1)
+            twists[group] = twist
+            groups = legs.group - (legs.group > group)
+            return replace(legs, group=groups, twists=twists, bends=bends[: len(legs.bends)])
+
+        return Removal(float((across * lengths)[begin:end].sum()), made, ties=True)
+
+    def _joined(self, legs: Legs, leg: int, vectors: Float, lengths: Float) -> Removal:
         """Return legs of which two that follow each other are one."""
         whole = lengths[leg] + lengths[leg + 1]
         mean = (lengths[leg] * vectors[leg] + lengths[leg + 1] * vectors[leg + 1]) / whole
@@ -216,12 +230,18 @@ class Simplifier:
         twists = legs.twists[legs.group[leg : leg + 2]]
         along = mean @ np.stack([np.cos(twists), np.sin(twists)])
         kept = leg + int(abs(along[1]) > abs(along[0]))
-        bends = np.delete(legs.bends, leg)
-        bends[leg] = along[kept - leg] * self._device.length
-        advances = np.delete(legs.advances, leg)
-        advances[leg] = whole
-        used, group = np.unique(np.delete(legs.group, 2 * leg + 1 - kept), return_inverse=True)
-        return float(change), Legs(group.astype(np.int64), legs.twists[used], bends, advances)
+        left = 2 * leg + 1 - kept
+
+        def made() -> Legs:
+            bends = np.delete(legs.bends, leg)
+            bends[leg] = along[kept - leg] * self._device.length
+            advances = np.delete(legs.advances, leg)
+            advances[leg] = whole
+            used, group = np.unique(np.delete(legs.group, left), return_inverse=True)
+            return Legs(group.astype(np.int64), legs.twists[used], bends, advances)
+
+        alone = np.count_nonzero(legs.group == legs.group[left]) == 1
+        return Removal(float(change), made, joins=True, ties=alone)
 
     def _fitted(self, legs: Legs, bounds: Float | None = None) -> Legs | None:
         """Return proved legs near to some that end in the pose, within bounds `(n, 2)`; None if not found."""

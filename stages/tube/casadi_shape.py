@@ -20,7 +20,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Float
 from anatomy.grid import read_only
-from stages.tube.casadi_model import CasadiTubes
+from stages.tube.casadi_model import CasadiEquilibrium, CasadiTubes
 from stages.tube.casadi_rates import (
     SAME_MM,
     about_z,
@@ -70,6 +70,7 @@ def derive_loaded(
     *,
     tissue_n_mm2: float = 0.0,
     tissue_from_mm: float = 0.0,
+    begun: "DerivedShape | None" = None,
 ) -> LoadedShape:
     """Return the shape of tubes that stood in tissue without a needle, when its tip is at `needle_mm`.
 
@@ -77,6 +78,10 @@ def derive_loaded(
     `stages.tube.mechanics.TubeMechanics`; the needle is straight, and its tip counts along the tubes from the
     front plate.  Tissue presses with `tissue_n_mm2` for each mm of tube and mm aside, beyond the arc length
     `tissue_from_mm`; one far stiffer than lungs makes the problem too steep.
+
+    Args:
+        begun: The shape with the needle in them from which they come.  Tubes that are turned against each
+            other may have several; without it the one is found that follows from the tubes alone.
 
     Raises:
         ConvergenceError: If no shape is found.
@@ -87,13 +92,10 @@ def derive_loaded(
     pieces = _pieces(tubes, needle, beta, needle_mm, tissue_from_mm)
     if not pieces:
         raise SettingsError("No tube is ahead of the front plate", expected="deployed tubes")
-    tip = before.base_from_tip
-    carried = Rotation.from_matrix(tip[:3, :3]) * Rotation.from_euler("z", -before.tip_angles_rad[0])
-    unloaded = [*tip[:3, 3], *np.roll(carried.as_quat(canonical=True), 1)]
     problem = _Shooting(tubes, needle, beta, needle_mm, pieces, tissue_n_mm2, tissue_from_mm)
-    reference = np.concatenate([unloaded, before.tip_angles_rad])
-    unknown = reference.copy()
-    for share in STAGES:
+    reference = _tip_of(before)
+    unknown = reference.copy() if begun is None else _tip_of(begun)
+    for share in STAGES if begun is None else STAGES[-1:]:
         unknown = problem.solved(unknown, reference, base, share)
     states = np.array(problem.body(unknown, reference, 1.0).full())
     places = np.concatenate([np.linspace(far, near, STEPS + 1)[1:] for far, near in pieces])
@@ -106,6 +108,13 @@ def derive_loaded(
         base_from_tip=read_only(found),
         tip_angles_rad=read_only(unknown[7:]),
     )
+
+
+def _tip_of(shape: "CasadiEquilibrium | DerivedShape") -> Float:
+    """Return position and quaternion of the tip's frame, as it is carried without turning, and all angles."""
+    tip, angles = shape.base_from_tip, shape.tip_angles_rad
+    carried = Rotation.from_matrix(tip[:3, :3]) * Rotation.from_euler("z", -angles[0])
+    return np.concatenate([tip[:3, 3], np.roll(carried.as_quat(canonical=True), 1), angles])
 
 
 def _pieces(
@@ -242,6 +251,7 @@ class DerivedShape:
         points_mm ((N, 3) float64): Of the centreline, in the frame of the scope tip.
         relative_rad ((N, n - 1) float64): Angles of the tubes around the innermost where they are, less its.
         base_from_tip ((4, 4) float64): Material frame of the innermost tube at its end.
+        tip_angles_rad ((n,) float64): Of each tube at its own end.
         way (tuple of (K, 4) float64): Arc lengths and points, mm, of every step; the last is the deployment.
         least_determinant: Least derivative of base by tip angles on the way: above 0 the tubes nowhere snap.
     """
@@ -250,6 +260,7 @@ class DerivedShape:
     points_mm: Float
     relative_rad: Float
     base_from_tip: Float
+    tip_angles_rad: Float
     least_determinant: float
     way: tuple[Float, ...]
 
@@ -297,6 +308,7 @@ def derive_shape(
         points_mm=read_only(body[:, 1:4].copy()),
         relative_rad=read_only(relative.copy()),
         base_from_tip=read_only(tip),
+        tip_angles_rad=read_only(tips if needle is None else tips[1:]),
         least_determinant=least,
         way=tuple(read_only(each[:, :4].copy()) for each in way),
     )
@@ -322,11 +334,13 @@ def derive_arrival(
 def derive_inserted(
     tubes: Sequence[Tube], needle: Tube, rotations_rad: ArrayLike, insertions_mm: ArrayLike, needle_mm: float
 ) -> Float:
-    """Return the tubes' tip frame `(4, 4)`, the needle `needle_mm` beyond it; errors as `derive_arrival`."""
+    """Return the tubes' tip frame `(4, 4)`, the needle `needle_mm` beyond it; errors as `derive_shape`."""
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)
     beta = out - [tube.length_mm for tube in tubes]
-    return derive_loaded(tubes, needle, turned, beta, float(out[0] + needle_mm)).base_from_tip
+    # Tubes that are turned against each other may have several shapes: theirs is the one they come to.
+    begun = derive_shape(tubes, rotations_rad, out, needle=needle) if np.ptp(turned) > 0.0 else None
+    return derive_loaded(tubes, needle, turned, beta, float(out[0] + needle_mm), begun=begun).base_from_tip
 
 
 def _stepped(model: CasadiTubes, base: Float, begin: Float, end: Float, tips: Float) -> tuple[Float, float]:

@@ -24,7 +24,7 @@ from stages.tube import (
     together,
     tube_shapes,
 )
-from stages.tube.casadi_shape import derive_shape
+from stages.tube.casadi_shape import derive_inserted, derive_loaded, derive_shape
 from stages.tube.device import Tube
 from stages.tube.kernels.shapes import TIP
 from tests.stages.tube.pairs import WIDE
@@ -237,3 +237,26 @@ def test_twisted_tubes_are_followed_with_their_needle_by_every_road() -> None:
     assert around.scope_from_tip[:3, 3] == pytest.approx(way.base_from_tip[:3, 3], abs=1e-9)
     derived = derive_shape(TWISTED, turned, inserted, needle=THIN)
     assert derived.base_from_tip[:3, 3] == pytest.approx(way.base_from_tip[:3, 3], abs=1e-5)
+
+
+def test_a_needle_that_is_inserted_leaves_opposed_tubes_in_the_shape_that_they_came_to() -> None:
+    """They have another one, to which the tubes alone lead."""
+    tubes = (
+        Tube(
+            outer_diameter_mm=0.95, inner_diameter_mm=0.8, length_mm=690.0, curved_length_mm=40.0,
+            precurvature_per_mm=0.025,
+        ),
+        Tube(
+            outer_diameter_mm=1.2, inner_diameter_mm=1.05, length_mm=640.0, curved_length_mm=25.0,
+            precurvature_per_mm=1.0 / 60.0,
+        ),
+    )  # fmt: skip
+    shaft = Tube(outer_diameter_mm=0.6, inner_diameter_mm=0.4, length_mm=840.0, slotted_segments=(SLOTS,))
+    turned, out = np.array([0.0, 4.182]), np.array([24.0, 24.0])
+    come_to = derive_shape(tubes, turned, out, needle=shaft).base_from_tip[:3, 3]
+    for needle_mm in (5.0, 60.0):
+        inserted = derive_inserted(tubes, shaft, turned, out, needle_mm)[:3, 3]
+        assert inserted == pytest.approx(come_to, abs=1e-4)
+    beta = out - [tube.length_mm for tube in tubes]
+    other = derive_loaded(tubes, shaft, turned + BEND_RAD, beta, 84.0).base_from_tip[:3, 3]
+    assert np.linalg.norm(other - come_to) > 1.0

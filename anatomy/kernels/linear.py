@@ -1,9 +1,9 @@
 """Small linear systems, solved in kernels without a library."""
 
-from anatomy.kernels.compiling import inner_kernel
+from anatomy.kernels.compiling import borrowing_kernel
 
 
-@inner_kernel
+@borrowing_kernel
 def solve_in_place(matrix, right):
     """Solve a small linear system in place; return the determinant, 0 if it is singular."""
     n = right.shape[0]

@@ -126,7 +126,8 @@ class Equilibrium:
         rear_ends = tubes.rear_ends(beta_mm[None], np.array([needle_mm]))[0].copy()
         self._cutting, n_steps = tubes.cut(rear_ends)
         self._nodes, self._steps = equilibrium.scratch_for(n_steps, tubes.count, tubes.count - 1)
-        torsion.twist(tubes.design, self._cutting, tip_angles_rad, self._nodes, self._steps)
+        self._scratch = equilibrium.solving_scratch(tubes.count)
+        torsion.twist(tubes.design, self._cutting, tip_angles_rad, self._nodes, self._steps, self._scratch[3])
         self._poses = np.zeros((n_steps + 1, 12))
         pose.lay(self._cutting, self._nodes, self._steps, self._poses)
 
@@ -151,7 +152,7 @@ class Equilibrium:
     @cached_property
     def least_determinant(self) -> float:
         """Least of the determinants along the tubes; -inf where two directions lose stability at once."""
-        return float(equilibrium.least_determinant(self._nodes, self._beta_mm))
+        return float(equilibrium.least_determinant(self._nodes, self._beta_mm, self._scratch))
 
     @property
     def stable(self) -> bool:
@@ -186,8 +187,7 @@ class Equilibrium:
     def determinant(self, arc_lengths_mm: ArrayLike) -> Float:
         """Return det d psi(s) / d psi_tip `(N,)`; see `least_determinant`."""
         s = self._arc_lengths(arc_lengths_mm)
-        n = self.mechanics.count
-        matrix, right = np.zeros((n - 1, n - 1)), np.zeros(n - 1)
+        matrix, _before, right, _work = self._scratch
         found = np.ones(len(s))
         for m, x in enumerate(s):
             dpsi, drate = self._derivatives_at(float(x))

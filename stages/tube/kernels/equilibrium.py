@@ -13,11 +13,11 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel, merged_kernel
 from anatomy.kernels.linear import solve_in_place
 from stages.tube.kernels.assembly import PIECE_COLUMNS, cut
-from stages.tube.kernels.pose import lay, turned
-from stages.tube.kernels.torsion import twist
+from stages.tube.kernels.pose import lay, put_pose, turned
+from stages.tube.kernels.torsion import FEW, SCRATCH_ROWS, twist
 
 TOLERANCE = 1e-12
 LARGEST_TURN = 0.8
@@ -39,7 +39,7 @@ SHARES = 8
 CONVERGED, STABLE, LEAST_DETERMINANT, RESIDUAL, TIP, RESULT_COLUMNS = 0, 1, 2, 3, 4, 16
 
 
-@inner_kernel
+@borrowing_kernel
 def _relative(dpsi, drate, at, beta, s, matrix):
     """Fill `matrix` (n - 1, n - 1) with how angles between the tubes at `s` depend on those at the tip."""
     last = matrix.shape[0]
@@ -50,7 +50,7 @@ def _relative(dpsi, drate, at, beta, s, matrix):
                 matrix[i, c] += max(s, beta[i]) * drate[at, c, i] - max(s, beta[last]) * drate[at, c, last]
 
 
-@kernel()
+@kernel(_nrt=False)
 def determinant_at(dpsi, drate, at, beta, s, matrix, right):
     """Return det d psi(s) / d psi_tip at or behind node `at`; `matrix` and `right` are scratch."""
     if matrix.shape[0] == 0:
@@ -123,11 +123,18 @@ def _turns_back(dpsi, drate, beta, at, matrix, before, right):
 
 
 @kernel()
-def least_determinant(nodes, beta):
+def solving_scratch(n):
+    """Return scratch for n tubes: two matrices, a right side of linear systems, and that of `twist`."""
+    last, rows = n - 1, SCRATCH_ROWS if n > FEW else 0
+    return np.zeros((last, last)), np.zeros((last, last)), np.zeros(last), np.zeros((rows, n, n))
+
+
+@kernel(_nrt=False)
+def least_determinant(nodes, beta, scratch):
     """Return the least determinant along the tubes; -inf where two directions turn unstable at once."""
     _s, _psi, _rate, dpsi, drate = nodes
+    matrix, before, right, _work = scratch
     last = dpsi.shape[2] - 1
-    matrix, before, right = np.zeros((last, last)), np.zeros((last, last)), np.zeros(last)
     least = 1.0
     if last == 0:
         return least
@@ -139,9 +146,10 @@ def least_determinant(nodes, beta):
 
 
 @merged_kernel
-def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
+def _newton_step(nodes, beta, base_angles, tip_angles, scratch):
     """Move the tip angles towards the wanted base angles; return the largest error before, rad."""
     _s, psi, rate, dpsi, drate = nodes
+    matrix, _before, right, _work = scratch
     last = tip_angles.shape[0] - 1
     worst = 0.0
     for i in range(last + 1):
@@ -152,9 +160,15 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     if last > 0:
         for i in range(last):
             right[i] = base_angles[i] - psi[0, i] - beta[i] * rate[0, i] - error
-        _relative(dpsi, drate, _FIRST_NODE, beta, beta[: last + 1].min(), matrix)
+        rearmost = beta[0]
+        for i in range(1, last + 1):
+            rearmost = min(rearmost, beta[i])
+        _relative(dpsi, drate, _FIRST_NODE, beta, rearmost, matrix)
         solve_in_place(matrix, right)
-        size = np.abs(right).max()
+        size = 0.0
+        for i in range(last):
+            # What is not a number stays.
+            size = size if abs(right[i]) <= size or size != size else abs(right[i])
         if not size < LARGEST_TURN:
             factor = LARGEST_TURN / size if size < math.inf else 0.0
             for i in range(last):
@@ -167,20 +181,20 @@ def _newton_step(nodes, beta, base_angles, tip_angles, matrix, right):
     return worst
 
 
-@inner_kernel
-def newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, enough):
+@borrowing_kernel
+def newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch, enough):
     """Let Newton's method find tip angles from a guess, to `enough` of an error; return the last one, rad."""
     worst = math.inf
     for _ in range(NEWTON_STEPS):
-        twist(design, cutting, tip_angles, nodes, steps)
-        worst = _newton_step(nodes, beta, base_angles, tip_angles, matrix, right)
+        twist(design, cutting, tip_angles, nodes, steps, scratch[3])
+        worst = _newton_step(nodes, beta, base_angles, tip_angles, scratch)
         if worst < enough:
             break
     return worst
 
 
 @merged_kernel
-def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
+def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch):
     """Find tip angles by raising the precurvature from nothing; return the last error, rad."""
     pieces, moments, directions, count = cutting
     tip_angles[:] = base_angles
@@ -190,7 +204,7 @@ def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, mat
         share = min(done + stride, 1.0)
         eased = (pieces, math.sqrt(share) * moments, directions, count)
         enough = TOLERANCE if share == 1.0 else NEAR_ENOUGH
-        worst = newton(design, eased, base_angles, beta, nodes, steps, tip_angles, matrix, right, enough)
+        worst = newton(design, eased, base_angles, beta, nodes, steps, tip_angles, scratch, enough)
         if worst < enough:
             done = share
             kept[:] = tip_angles
@@ -201,7 +215,7 @@ def _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, mat
 
 
 @merged_kernel
-def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right):
+def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch):
     """Start from angles all round until an equilibrium is stable, else take the first; return its error."""
     n = tip_angles.shape[0]
     any_found = math.inf
@@ -212,45 +226,43 @@ def _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angle
         for i in range(n - 1):
             tip_angles[i] += 2.0 * math.pi * (code % ROUND) / ROUND
             code //= ROUND
-        worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
+        worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch, TOLERANCE)
         if worst < TOLERANCE:
-            if least_determinant(nodes, beta) > 0.0:
+            if least_determinant(nodes, beta, scratch) > 0.0:
                 return worst
             if any_found == math.inf:
                 any_found = worst
                 kept[:] = tip_angles
     tip_angles[:] = kept
     if any_found < math.inf:
-        twist(design, cutting, tip_angles, nodes, steps)
+        twist(design, cutting, tip_angles, nodes, steps, scratch[3])
     return any_found
 
 
 @kernel()
-def settle(design, cutting, base_angles, beta, nodes, steps, prefer_stable, tip_angles):
+def settle(design, cutting, base_angles, beta, nodes, steps, scratch, prefer_stable, tip_angles):
     """Find the equilibrium next to the guess in `tip_angles`, which gets its angles, `nodes` the rest.
 
     If Newton's method fails from there, or ends at an unstable one and stable ones are preferred, the
     precurvature is raised from nothing, and then angles all round are tried.  Returns the largest error of a
     base angle and the least determinant.
     """
-    last = tip_angles.shape[0] - 1
-    matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
-    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch, TOLERANCE)
+    least = least_determinant(nodes, beta, scratch) if worst < TOLERANCE else -math.inf
     if least > 0.0 or (worst < TOLERANCE and not prefer_stable):
         return worst, least
     first, first_worst = tip_angles.copy(), worst
-    worst = _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right)
-    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    worst = _continued(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch)
+    least = least_determinant(nodes, beta, scratch) if worst < TOLERANCE else -math.inf
     if least > 0.0:
         return worst, least
-    worst = _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right)
-    least = least_determinant(nodes, beta) if worst < TOLERANCE else -math.inf
+    worst = _tried_all_round(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch)
+    least = least_determinant(nodes, beta, scratch) if worst < TOLERANCE else -math.inf
     if least > 0.0 or not first_worst < TOLERANCE:
         return worst, least
     tip_angles[:] = first
-    twist(design, cutting, tip_angles, nodes, steps)
-    return first_worst, least_determinant(nodes, beta)
+    twist(design, cutting, tip_angles, nodes, steps, scratch[3])
+    return first_worst, least_determinant(nodes, beta, scratch)
 
 
 @kernel()
@@ -281,16 +293,18 @@ def settle_many(design, base_angles, beta, step, prefer_stable, tip_angles, resu
     n = base_angles.shape[1]
     pieces, moments, directions = cutting_scratch(design, n)
     nodes, steps = scratch_for(_FIRST_NODE, n, n - 1)
-    poses = np.zeros((1, 12))
+    poses, scratch = np.zeros((1, 12)), solving_scratch(n)
     for m in range(beta.shape[0]):
         count, n_steps = cut(design, beta[m], step, pieces, moments, directions)
         if n_steps + 1 != poses.shape[0]:
             nodes, steps = scratch_for(n_steps, n, n - 1)
             poses = np.zeros((n_steps + 1, 12))
         cutting, tip = (pieces, moments, directions, count), tip_angles[m]
-        worst, least = settle(design, cutting, base_angles[m], beta[m], nodes, steps, prefer_stable, tip)
+        worst, least = settle(
+            design, cutting, base_angles[m], beta[m], nodes, steps, scratch, prefer_stable, tip
+        )
         lay(cutting, nodes, steps, poses)
-        turned(poses[n_steps], tip[0], results[m, TIP:])
+        put_pose(results[m, TIP:], turned(poses[n_steps], tip[0]))
         results[m, CONVERGED] = 1.0 if worst < TOLERANCE else 0.0
         results[m, STABLE] = 1.0 if least > 0.0 else 0.0
         results[m, LEAST_DETERMINANT] = least

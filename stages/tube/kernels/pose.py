@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from anatomy.kernels.compiling import inner_kernel, kernel
+from anatomy.kernels.compiling import borrowing_kernel, inlined_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, SOFTNESS
 
 GAUSS = 0.5 - math.sqrt(3.0) / 6.0
@@ -21,11 +21,9 @@ SMALL_ANGLE2 = 1e-6
 """Below this square of an angle, series take the place of quotients that lose digits."""
 
 
-@inner_kernel
-def _exponential(twist, out, row):
-    """Write exp of the twist, rotation and translation, as pose `out[row]`."""
-    x, y, z = twist[0], twist[1], twist[2]
-    u, v, w = twist[3], twist[4], twist[5]
+@inlined_kernel
+def _exponential(x, y, z, u, v, w):
+    """Return exp of a twist, rotation (x, y, z) and translation (u, v, w), as a pose."""
     a2 = x * x + y * y + z * z
     if a2 < SMALL_ANGLE2:
         sine = 1.0 - a2 / 6.0 * (1.0 - a2 / 20.0)
@@ -38,44 +36,47 @@ def _exponential(twist, out, row):
         rest = (1.0 - sine) / a2
     along = rest * (x * u + y * v + z * w)
     straight = 1.0 - rest * a2
-    out[row, 0] = 1.0 - versine * (y * y + z * z)
-    out[row, 1] = versine * x * y - sine * z
-    out[row, 2] = versine * x * z + sine * y
-    out[row, 3] = versine * x * y + sine * z
-    out[row, 4] = 1.0 - versine * (x * x + z * z)
-    out[row, 5] = versine * y * z - sine * x
-    out[row, 6] = versine * x * z - sine * y
-    out[row, 7] = versine * y * z + sine * x
-    out[row, 8] = 1.0 - versine * (x * x + y * y)
-    out[row, 9] = straight * u + versine * (y * w - z * v) + along * x
-    out[row, 10] = straight * v + versine * (z * u - x * w) + along * y
-    out[row, 11] = straight * w + versine * (x * v - y * u) + along * z
+    return (
+        1.0 - versine * (y * y + z * z), versine * x * y - sine * z, versine * x * z + sine * y,
+        versine * x * y + sine * z, 1.0 - versine * (x * x + z * z), versine * y * z - sine * x,
+        versine * x * z - sine * y, versine * y * z + sine * x, 1.0 - versine * (x * x + y * y),
+        straight * u + versine * (y * w - z * v) + along * x,
+        straight * v + versine * (z * u - x * w) + along * y,
+        straight * w + versine * (x * v - y * u) + along * z,
+    )  # fmt: skip
 
 
-@inner_kernel
+@merged_kernel
 def _compose(a, i, b, out, k):
-    """Write the pose `a[i] b[0]` to `out[k]`."""
+    """Write the pose `a[i] b` to `out[k]`."""
     for r in range(3):
         x, y, z = a[i, 3 * r], a[i, 3 * r + 1], a[i, 3 * r + 2]
-        out[k, 3 * r] = x * b[0, 0] + y * b[0, 3] + z * b[0, 6]
-        out[k, 3 * r + 1] = x * b[0, 1] + y * b[0, 4] + z * b[0, 7]
-        out[k, 3 * r + 2] = x * b[0, 2] + y * b[0, 5] + z * b[0, 8]
-        out[k, 9 + r] = x * b[0, 9] + y * b[0, 10] + z * b[0, 11] + a[i, 9 + r]
+        out[k, 3 * r] = x * b[0] + y * b[3] + z * b[6]
+        out[k, 3 * r + 1] = x * b[1] + y * b[4] + z * b[7]
+        out[k, 3 * r + 2] = x * b[2] + y * b[5] + z * b[8]
+        out[k, 9 + r] = x * b[9] + y * b[10] + z * b[11] + a[i, 9 + r]
 
 
-@inner_kernel
-def turned(pose, angle, out):
-    """Write a pose turned about its own z by `angle`."""
+@borrowing_kernel
+def turned(pose, angle):
+    """Return a pose turned about its own z by `angle`."""
     c, s = math.cos(angle), math.sin(angle)
-    for r in range(3):
-        x, y = pose[3 * r], pose[3 * r + 1]
-        out[3 * r] = c * x + s * y
-        out[3 * r + 1] = c * y - s * x
-        out[3 * r + 2] = pose[3 * r + 2]
-        out[9 + r] = pose[9 + r]
+    return (
+        c * pose[0] + s * pose[1], c * pose[1] - s * pose[0], pose[2],
+        c * pose[3] + s * pose[4], c * pose[4] - s * pose[3], pose[5],
+        c * pose[6] + s * pose[7], c * pose[7] - s * pose[6], pose[8],
+        pose[9], pose[10], pose[11],
+    )  # fmt: skip
 
 
-@inner_kernel
+@borrowing_kernel
+def put_pose(out, pose):
+    """Write a pose to `out`."""
+    for m in range(12):
+        out[m] = pose[m]
+
+
+@borrowing_kernel
 def curvature(cutting, k, share, h, psi, rate, at):
     """Return Bishop curvature (x, y) at a share of the step ahead of node `at`, 1/mm, angles on a cubic."""
     pieces, moments, directions, _count = cutting
@@ -93,65 +94,49 @@ def curvature(cutting, k, share, h, psi, rate, at):
     return pieces[k, SOFTNESS] * x, pieces[k, SOFTNESS] * y
 
 
-@inner_kernel
-def step_of(cutting, nodes, steps, at, begin, end, twist, out):
-    """Write the motion along the share from `begin` to `end` of the step ahead of node `at` to `out[0]`.
-
-    `out` is (2, 12); `twist` (6,) gets the twist whose exponential it is, but for a turn about its own z by
-    the torsion of the one bent tube, where there is one.
-    """
+@borrowing_kernel
+def step_of(cutting, nodes, steps, at, begin, end):
+    """Return the motion along the share from `begin` to `end` of the step ahead of node `at`."""
     pieces, moments, directions, _count = cutting
     psi, rate = nodes[1], nodes[2]
     lengths, piece_of = steps
     k = piece_of[at]
     h = (end - begin) * lengths[at]
-    twist[:] = 0.0
-    twist[5] = h
     if pieces[k, BENT] == 1.0:
         i = int(pieces[k, BENT_TUBE])
         kappa = pieces[k, SOFTNESS] * moments[k, i]
         angle = psi[at, i] + begin * lengths[at] * rate[at, i] + directions[k, i]
-        twist[0] = h * kappa * math.cos(angle)
-        twist[1] = h * kappa * math.sin(angle)
-        twist[2] = h * rate[at, i]
-        _exponential(twist, out, 1)
-        turned(out[1], -twist[2], out[0])
-        return
+        x, y, z = h * kappa * math.cos(angle), h * kappa * math.sin(angle), h * rate[at, i]
+        return turned(_exponential(x, y, z, 0.0, 0.0, h), -z)
+    x1 = y1 = x2 = y2 = 0.0
     if pieces[k, BENT] != 0.0:
-        ux1, uy1 = curvature(cutting, k, begin + GAUSS * (end - begin), lengths[at], psi, rate, at)
-        ux2, uy2 = curvature(cutting, k, end - GAUSS * (end - begin), lengths[at], psi, rate, at)
-        c = COMMUTATOR * h * h
-        twist[0] = 0.5 * h * (ux1 + ux2)
-        twist[1] = 0.5 * h * (uy1 + uy2)
-        twist[2] = c * (ux1 * uy2 - uy1 * ux2)
-        twist[3] = c * (uy1 - uy2)
-        twist[4] = c * (ux2 - ux1)
-    _exponential(twist, out, 0)
+        x1, y1 = curvature(cutting, k, begin + GAUSS * (end - begin), lengths[at], psi, rate, at)
+        x2, y2 = curvature(cutting, k, end - GAUSS * (end - begin), lengths[at], psi, rate, at)
+    c = COMMUTATOR * h * h
+    return _exponential(
+        0.5 * h * (x1 + x2), 0.5 * h * (y1 + y2), c * (x1 * y2 - y1 * x2), c * (y1 - y2), c * (x2 - x1), h
+    )
 
 
-@kernel()
+@kernel(_nrt=False)
 def lay(cutting, nodes, steps, poses):
     """Fill `poses` (N + 1, 12) with the Bishop frame of every node; the first is the identity."""
-    twist, motion = np.zeros(6), np.zeros((2, 12))
     for m in range(12):
         poses[0, m] = 1.0 if m in (0, 4, 8) else 0.0
     for at in range(steps[0].shape[0]):
-        step_of(cutting, nodes, steps, at, 0.0, 1.0, twist, motion)
-        _compose(poses, at, motion, poses, at + 1)
+        _compose(poses, at, step_of(cutting, nodes, steps, at, 0.0, 1.0), poses, at + 1)
 
 
-@kernel()
+@kernel(_nrt=False)
 def frames_at(cutting, nodes, steps, poses, arc_lengths, found, angles, rates):
     """Fill poses (M, 12), psi and u (M, n) at arc lengths (M,) between front plate and tip."""
     s, psi, rate, _dpsi, _drate = nodes
     lengths = steps[0]
-    twist, motion = np.zeros(6), np.zeros((2, 12))
     for m in range(arc_lengths.shape[0]):
         at = min(max(np.searchsorted(s, arc_lengths[m], "right") - 1, 0), lengths.shape[0] - 1)
         h = lengths[at]
         t = min(max((arc_lengths[m] - s[at]) / h, 0.0), 1.0)
-        step_of(cutting, nodes, steps, at, 0.0, t, twist, motion)
-        _compose(poses, at, motion, found, m)
+        _compose(poses, at, step_of(cutting, nodes, steps, at, 0.0, t), found, m)
         a = 1.0 - t * t * (3.0 - 2.0 * t)
         for i in range(psi.shape[1]):
             angles[m, i] = a * psi[at, i] + (1.0 - a) * psi[at + 1, i]

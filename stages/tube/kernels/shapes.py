@@ -12,7 +12,14 @@ import numpy as np
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, FAR, NEAR, PIECE_COLUMNS, SOFTNESS, cut
-from stages.tube.kernels.equilibrium import TOLERANCE, cutting_scratch, least_determinant, newton, scratch_for
+from stages.tube.kernels.equilibrium import (
+    TOLERANCE,
+    cutting_scratch,
+    least_determinant,
+    newton,
+    scratch_for,
+    solving_scratch,
+)
 from stages.tube.kernels.pose import GAUSS, curvature, frames_at, lay
 from stages.tube.kernels.sweep import sweep_of
 
@@ -37,15 +44,14 @@ LEAST, STRAIN, SWEEP, LEADER, ERROR, EXTENSION, TIP, SHAPE_COLUMNS = 0, 1, 2, 3,
 
 
 @inner_kernel
-def _settled(design, base_angles, beta, step, tip_angles):
+def _settled(design, base_angles, beta, step, tip_angles, scratch):
     """Solve from a guess; return the error of the base angles, the cutting, nodes and steps."""
     last = base_angles.shape[0] - 1
     pieces, moments, directions = cutting_scratch(design, last + 1)
     count, n_steps = cut(design, beta, step, pieces, moments, directions)
     cutting = (pieces, moments, directions, count)
     nodes, steps = scratch_for(n_steps, last + 1, last)
-    matrix, right = np.zeros((last, last)), np.zeros(last)
-    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, matrix, right, TOLERANCE)
+    worst = newton(design, cutting, base_angles, beta, nodes, steps, tip_angles, scratch, TOLERANCE)
     return worst, cutting, nodes, steps
 
 
@@ -76,20 +82,21 @@ def reach(design, base, turn, begin, end, step, tip_angles):
     """
     done, stride, least = 0.0, 1.0, 1.0
     tips, back = tip_angles.copy(), tip_angles.copy()
+    scratch = solving_scratch(tips.shape[0])
     while True:
         share = min(done + stride, 1.0)
         moved = (share - done) * turn
         beta = begin + share * (end - begin)
         tips[:] = tip_angles + moved
-        worst, cutting, nodes, steps = _settled(design, base + share * turn, beta, step, tips)
+        worst, cutting, nodes, steps = _settled(design, base + share * turn, beta, step, tips, scratch)
         here = worst < TOLERANCE
-        determinant = least_determinant(nodes, beta) if here else -math.inf
+        determinant = least_determinant(nodes, beta, scratch) if here else -math.inf
         back[:] = tips - moved
         stray = _largest(back, tip_angles)
         here = here and determinant > 0.0 and stray <= LARGEST_STRAY_RAD
         if here and stray > UNSUSPICIOUS_RAD:
             there = begin + done * (end - begin)
-            worst = _settled(design, base + done * turn, there, step, back)[0]
+            worst = _settled(design, base + done * turn, there, step, back, scratch)[0]
             here = worst < TOLERANCE and _largest(back, tip_angles) <= SAME_BRANCH_RAD
         if here:
             done = share

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.arcs import point_on_arc
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel, merged_kernel
 from stages.tube.kernels import planar, wall_exit
 from stages.tube.kernels.shapes import CURVATURE, DIRECTION, LENGTH, RADIUS, bend_towards, carried
 
@@ -123,7 +123,7 @@ def grow(places, groups, ends, middles, radii, tolerance, nodes, errors, leaf):
     return count
 
 
-@inner_kernel
+@borrowing_kernel
 def _seen(base, forward, row, at):
     """Return a vector of a stretch in the frame of the patient: `base` (9,) is +x, +y and +z of the scope."""
     x, y, z = row[at], row[at + 1], row[at + 2]
@@ -134,11 +134,13 @@ def _seen(base, forward, row, at):
     )
 
 
-@inner_kernel
-def _place_turned(environment, tubes, frame, tree, wanted, reasons, traces, placed):
-    """Follow shapes from one scope tip with one rotation of all tubes together; see `place_tree`."""
+@borrowing_kernel
+def _place_turned(environment, tubes, frame, tree, wanted, before, reasons, traces, placed):
+    """Follow shapes from one scope tip with one rotation of all tubes together; see `place_tree`.
+
+    `before` (S + 1,) int64 begins with 0, and is filled: how many shapes before each are wanted.
+    """
     depth, skip, first, stretches, radius, clearance, first_shape, shapes = tree
-    before = np.zeros(shapes.shape[0] + 1, np.int64)
     for e in range(shapes.shape[0]):
         before[e + 1] = before[e] + wanted[shapes[e]]
     across = (frame[0, 0], frame[1, 0], frame[2, 0], frame[0, 1], frame[1, 1], frame[2, 1])
@@ -195,14 +197,16 @@ def place_tree(environment, tubes, frames, tree, wanted, reasons, traces, placed
     shapes; `placed` (T S, PLACED_COLUMNS) receives those that fit, one rotation after the other, and `counts`
     (T,) how many.
     """
-    total = 0
+    total, before = 0, np.zeros(wanted.shape[1] + 1, np.int64)
     for t in range(frames.shape[0]):
         rows = placed[total:]
-        counts[t] = _place_turned(environment, tubes, frames[t], tree, wanted[t], reasons, traces, rows)
+        counts[t] = _place_turned(
+            environment, tubes, frames[t], tree, wanted[t], before, reasons, traces, rows
+        )
         total += counts[t]
 
 
-@kernel(nogil=True)
+@kernel(nogil=True, _nrt=False)
 def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     """Validate a shape of any tubes from the scope tip pose `base`.
 
@@ -229,7 +233,7 @@ def validate_arcs(environment, tubes, base, normal, arcs, beside, trace, tip):
     return wall_exit.ACCEPTED if trace[wall_exit.PHASE] == wall_exit.IN_TISSUE else wall_exit.NO_EXIT
 
 
-@inner_kernel
+@borrowing_kernel
 def tip_of_arcs(base, normal, arcs):
     """Return the pose at the end of a shape's arcs; see `validate_arcs`."""
     pose = (base[0], base[1], base[2], base[3], base[4], base[5])

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from anatomy.kernels.arcs import normal_on_arc, point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, inner_kernel, kernel, merged_kernel
 from stages.tube.kernels.assembly import BENT, BENT_TUBE, FAR, NEAR, PIECE_COLUMNS, SOFTNESS, cut
 from stages.tube.kernels.equilibrium import (
     TOLERANCE,
@@ -55,7 +55,7 @@ def _settled(design, base_angles, beta, step, tip_angles, scratch):
     return worst, cutting, nodes, steps
 
 
-@inner_kernel
+@borrowing_kernel
 def _largest(one, other):
     worst = 0.0
     for i in range(one.shape[0]):
@@ -110,7 +110,7 @@ def reach(design, base, turn, begin, end, step, tip_angles):
                 return min(determinant, 0.0), cutting, nodes, steps
 
 
-@inner_kernel
+@borrowing_kernel
 def largest_strain(design, strained, beta, cutting, nodes, steps, first=0):
     """Return the largest strain of bending ahead of the scope tip, of all bodies from the first named on."""
     pieces, moments, directions, _count = cutting
@@ -148,7 +148,7 @@ def _mean_curvature(cutting, nodes, steps, k, begin, end):
     return x, y
 
 
-@inner_kernel
+@borrowing_kernel
 def _changes(cutting, nodes, steps, k):
     """Return by how much the curvature vector changes along piece `k`, at most, and its size there."""
     psi, rate = nodes[1], nodes[2]
@@ -204,7 +204,7 @@ def _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places):
     return number, between
 
 
-@inner_kernel
+@borrowing_kernel
 def lay_out(design, radii, beta, cutting, nodes, steps, poses, arcs, first, places, scratch):
     """Write the arcs of a deployment; return their number, -1 if there is no room, and their error in mm."""
     number, error = _lay_arcs(design, radii, beta, cutting, nodes, steps, arcs, first, places)

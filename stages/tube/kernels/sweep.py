@@ -5,10 +5,10 @@
 
 import math
 
-from anatomy.kernels.compiling import inner_kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, merged_kernel
 
 
-@inner_kernel
+@borrowing_kernel
 def _distance(bodies, one, other, j):
     x = bodies[one, j, 0] - bodies[other, j, 0]
     y = bodies[one, j, 1] - bodies[other, j, 1]
@@ -61,7 +61,7 @@ def _diagonal_bow(bodies, states, parents, state):
     return worst
 
 
-@inner_kernel
+@borrowing_kernel
 def sweep_of(bodies, states, parents, state, sagitta):
     """Return how far the body was from its final place, and from its final track, at any step.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from anatomy.base.typed import Bool, Float, Labels, UInt16
 from anatomy.kernels.arcs import point_on_arc, pose_on_arc
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance, label_at
 from anatomy.kernels.labels import AIRWAY, BRANCH_SHIFT, FISSURE, LUMEN, OUTSIDE, VESSEL
 from stages.tube.kernels.planar import INNER_RADIUS, MAX_WALL_RUN, MIN_WALL_ANGLE, OUTER_RADIUS
@@ -103,7 +103,7 @@ def _wall_normal(labels, geometry, x, y, z):
     return -mu / norm, -mv / norm, -mw / norm
 
 
-@kernel()
+@kernel(_nrt=False)
 def wall_angle(labels, geometry, pose):
     """Return the angle in rad between a tangent and the lumen's border at its point; pi/2 is square on."""
     normal = _wall_normal(labels, geometry, pose[0], pose[1], pose[2])
@@ -136,7 +136,7 @@ def _leave_lumen(environment, tubes, trace, pose, bend, inside, outside, s0):
     trace[REFUSAL] = FLAT_EXIT if trace[WALL_ANGLE] < tubes[MIN_WALL_ANGLE] else trace[HAZARD]
 
 
-@inner_kernel
+@borrowing_kernel
 def _first_in_lumen(environment, pose, bend, begin, end):
     """Return the first of points LOOK_MM apart that lies in a lumen, `end` among them; -1 if none does."""
     labels, geometry = environment.labels, environment.geometry
@@ -225,7 +225,7 @@ def _run_in_wall(environment, pose, bend, begin, end, radius):
     return run
 
 
-@inner_kernel
+@borrowing_kernel
 def _march_beyond(environment, tubes, trace, pose, bend, s0, s, end, radius, clearance):
     """Follow one arc from `s` to `end`, out of the lumen; see `march`."""
     required = radius + clearance
@@ -252,7 +252,7 @@ def _march_beyond(environment, tubes, trace, pose, bend, s0, s, end, radius, cle
         s = to
 
 
-@kernel()
+@kernel(_nrt=False)
 def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
     """Follow one arc of the tube, from `s0` mm beyond the scope tip, and validate every point of it.
 
@@ -296,7 +296,7 @@ def march(environment, tubes, trace, pose, bend, s0, length, radius, clearance):
         return ACCEPTED
 
 
-@kernel()
+@kernel(_nrt=False)
 def reset(trace):
     """Put a trace at the scope tip, in the lumen."""
     trace[:] = 0.0

@@ -5,16 +5,19 @@ from every corner to a union of solid voxel boxes is the Euclidean distance tran
 corners that touch the structure: exact, with voxels as solid boxes and any voxel size.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.errors import GridMismatchError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Array, Float, Mask, UInt16
+from anatomy.base.typed import Float, Mask, UInt16
 from anatomy.grid import Grid, read_only
 from anatomy.kernels import field as kernel
+from anatomy.kernels.distance import NONE, fill_distances
 
-MAX_STORED = np.iinfo(np.uint16).max
+MAX_STORED = NONE
 """Distances from this on, 256 mm, are stored as it: no device looks so far."""
 
 SOLID = 0.5
@@ -24,8 +27,8 @@ CENTRES = 0.0
 
 GEOMETRY_SHAPE = (3, 6)
 
-ROUNDING_MM = 2e-5
-"""Bounds the rounding of a stored distance below 256 mm in single precision."""
+LONGEST = 8192
+"""Voxels along the longest side of a grid: the squares of more distances would not fit into 64 bits."""
 
 
 def corner_geometry(grid: Grid, half_voxels: float = SOLID) -> Float:
@@ -93,21 +96,23 @@ def touched_corners(mask: Mask) -> Mask:
 
 def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOLID) -> UInt16:
     """Return the distance from voxel corners (`CENTRES`: centres) to a mask, in 1/256 mm rounded down."""
-    import edt
-
-    spacing = tuple(float(s) for s in np.asarray(spacing_mm))
-    free = touched_corners(mask) if half_voxels == SOLID else np.array(mask, dtype=bool, order="F")
-    if not free.any():
-        return np.asfortranarray(np.full(free.shape, MAX_STORED, dtype=np.uint16))
-    np.logical_not(free, out=free)
-    distance: Array = edt.edt(free, anisotropy=spacing, order="F", black_border=False, parallel=2)
-    # Never too long: the transform adds up float32 voxel sizes, one rounding a voxel, half of it on average.
-    # Single precision rounds 1 by half a unit in the last place.
-    distance *= 1.0 - (max(free.shape) + 16) * (2.0**-24)
-    distance -= ROUNDING_MM
-    distance *= kernel.UNITS_PER_MM
-    np.clip(distance, 0, MAX_STORED, out=distance)
-    return distance.astype(np.uint16, order="F")
+    touched = touched_corners(mask) if half_voxels == SOLID else np.asarray(mask, order="F")
+    near: UInt16 = ~touched * np.uint16(NONE)
+    # A voxel that is as large as distances can be is as far as can be told from the next one.
+    sides = np.minimum(np.asarray(spacing_mm, dtype=np.float64), NONE / kernel.UNITS_PER_MM + 1.0)
+    # The largest voxel has sides of 2**16 to 2**17 steps, so that the squares of all distances fit.
+    shift = min(17 - math.ceil(math.log2(float(sides.max()))), 40)
+    # Smaller by a share that is more than places of points are off: no distance is too long, and with what is
+    # rounded none is too short by two of the steps in which it is stored.
+    squares = np.floor((sides * 2.0**shift) ** 2 * (1.0 - 2.0**-32)).astype(np.int64)
+    if max(near.shape) > LONGEST + 1 or squares.min() < 1 << 16:
+        raise GridMismatchError(
+            f"A grid of {near.shape} corners has voxels of {np.asarray(spacing_mm).tolist()} mm",
+            expected=f"at most {LONGEST} voxels a side, whose sides differ by less than a factor of 256",
+            remedy="Resample the masks to voxels that are nearly cubes",
+        )
+    fill_distances(near, squares, shift)
+    return near
 
 
 def distance_field(name: str, mask: Mask, grid: Grid, half_voxels: float = SOLID) -> DistanceField:

@@ -40,8 +40,6 @@ EXACT_REACH_MM = 0.5
 """How far beyond the required clearance such a proof searches voxels: its longest step near obstacles."""
 ROUNDING = 1e-9
 """Searches go farther than what they may find by this share."""
-TRANSFORM_ROUNDING = 1e-4
-"""Share by which distance transforms are made smaller before they are rounded down; they have less."""
 
 
 @kernel(inline="always", _nrt=False)
@@ -110,7 +108,7 @@ def most_distance(field, geometry, x, y, z):
     if not (1.0 <= u < ni - 2 and 1.0 <= v < nj - 2 and 1.0 <= w < nk - 2):
         return math.inf
     i, j, k = int(u + 0.5), int(v + 0.5), int(w + 0.5)
-    here = (float(field[i, j, k]) * (1.0 + TRANSFORM_ROUNDING) + 2.0) / UNITS_PER_MM
+    here = (float(field[i, j, k]) + 2.0) / UNITS_PER_MM
     square = here * here
     total = beside = 0.0
     for axis in range(3):

@@ -13,7 +13,7 @@ import numpy as np
 
 from anatomy.base.errors import SettingsError
 from anatomy.base.typed import Float
-from anatomy.kernels.field import TRANSFORM_ROUNDING, UNITS_PER_MM
+from anatomy.kernels.field import UNITS_PER_MM
 from anatomy.structures import LUMEN, obstacle_bits
 from lungaccess.planning.coupled.atlas import Atlas
 from lungaccess.planning.coupled.cost_bound import CostBound
@@ -130,7 +130,7 @@ class LayerBound:
         for moves in itertools.product((0, 1), repeat=3):
             moved = zip(window, moves, strict=True)
             at = tuple(slice(each.start + move, each.stop + move) for each, move in moved)
-            here = (corners[at] * (1.0 + TRANSFORM_ROUNDING) + 2.0) / UNITS_PER_MM
+            here = (corners[at] + 2.0) / UNITS_PER_MM
             low, high = np.minimum(low, here), np.maximum(high, here)
         blocked = (lung.labels[window] & obstacle_bits(fissures)) > 0
         return np.where(blocked, 0.0, np.minimum(low + diagonal, high + 0.5 * diagonal))

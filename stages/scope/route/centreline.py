@@ -9,7 +9,7 @@ from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError, TargetError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Int
-from anatomy.fields import CENTRES, ROUNDING_MM, SOLID, DistanceField, corner_geometry, distance_field
+from anatomy.fields import CENTRES, SOLID, DistanceField, corner_geometry, distance_field
 from anatomy.grid import Grid, Volume, read_only
 from anatomy.kernels.field import exact_at
 from anatomy.lung import Lung
@@ -284,7 +284,7 @@ class _Walls:
         self._field = field or distance_field("wall", wall, grid, half_voxels)
         self._labels = np.asfortranarray(wall.astype(np.uint16))
         self._geometry = corner_geometry(grid, half_voxels)
-        self._lost = float(np.linalg.norm(grid.spacing_mm)) + ROUNDING_MM + 1.0 / 256.0
+        self._lost = float(np.linalg.norm(grid.spacing_mm)) + 1.0 / 256.0
         # Below so many edges of a voxel the distance is searched exactly: the bound loses up to half.
         self._thin_mm = 6.0 * float(grid.spacing_mm.min())
         self._taken_off = 0.0 if half_voxels == SOLID else 0.5 * float(grid.spacing_mm.min())

@@ -11,13 +11,14 @@ import numpy as np
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
-from anatomy.base.typed import Array, Float, Int, Int32, Mask, UInt16
-from anatomy.fields import MAX_STORED, DistanceField, corner_geometry, distance_corners, distance_field
+from anatomy.base.records import frozen_record
+from anatomy.base.typed import Array, Float, Int, Mask, UInt16
+from anatomy.fields import DistanceField, corner_geometry, distance_corners, distance_field, renewed_corners
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN, UNKNOWN
 from anatomy.lung import Lung
 from anatomy.mask_findings import mask_findings
-from anatomy.morphology import bounds, window
+from anatomy.morphology import Window, bounds, hull, window
 from anatomy.patient import PatientImages
 from anatomy.plausibility import warnings_of_findings, with_accepted
 from anatomy.sides import border_of, coarse_sides, points_of_sides
@@ -48,30 +49,28 @@ def lung_key(sources: Mapping[str, str]) -> str:
 
 
 class Reused:
-    """What was made last, and from which arrays: it is made again only where one of these has changed.
+    """The images and the lung that were made last: what has not changed since is taken from them.
 
-    So a patient of which a person corrects a mask is built anew within a second or two, and is the very
-    lung that is built without what was made before.
+    So a patient of which a person corrects a mask is built anew within a second or so, and is the very lung
+    that is built without what was made before.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, images: PatientImages | None = None, lung: Lung | None = None) -> None:
         self._kept: dict[str, tuple[tuple[Array | None, ...], Any]] = {}
+        self.lung: Lung | None = None
+        self._images: PatientImages | None = None
+        if images is not None and lung is not None:
+            self.take(images, lung)
 
-    @classmethod
-    def of(cls, images: PatientImages, lung: Lung) -> "Reused":
-        """Return what was made when a lung was built from images."""
-        reused = cls()
-        reused._kept["tree"] = (images.lumen.array,), lung.tree
-        reused._kept["lumen_depth"] = (images.lumen.array,), lung.lumen_depth
+    def take(self, images: PatientImages, lung: Lung) -> None:
+        """Take what was made when a lung was built from images."""
+        self._images, self.lung = images, lung
+        self._kept["tree"] = (images.lumen.array,), lung.tree
+        self._kept["lumen_depth"] = (images.lumen.array,), lung.lumen_depth
         for name in CUT:
             volume, cut = getattr(images, name), getattr(lung, name)
             if cut is not None:
-                reused._kept[name] = (volume.array, lung.grid.lps_from_ijk), cut.array
-        for name in SINGLE_FIELDS:
-            if name in lung.fields:
-                solid = (lung.labels & structures.FIELD_BITS[name]) != 0
-                reused._kept[name] = (solid, lung.grid.spacing_mm), lung.fields[name].corners
-        return reused
+                self._kept[name] = (volume.array, lung.grid.lps_from_ijk), cut.array
 
     def get(self, name: str, sources: tuple[Array | None, ...], make: Callable[[], Any]) -> Any:
         """Return what was made of the same sources, or make and keep it."""
@@ -79,6 +78,33 @@ class Reused:
         if known is None or not all(map(_are_same, known[0], sources)):
             self._kept[name] = known = sources, make()
         return known[1]
+
+    def changed(self, images: PatientImages) -> Window | None:
+        """Return the box of voxels in which vessels, nodules or fissures have changed, and nothing else has.
+
+        It is None if something else has changed, or nothing is known of before.
+        """
+        before = self._images
+        if before is None or (before.fissures is None) != (images.fissures is None):
+            return None
+        if not np.array_equal(before.grid.lps_from_ijk, images.grid.lps_from_ijk):
+            return None
+        if not all(
+            _are_same(_array_of(before, name), _array_of(images, name))
+            for name in ("lung", "lumen", "wall", "fissure_band")
+        ):
+            return None
+        found = np.zeros(images.grid.shape, dtype=np.bool_, order="F")
+        for name in ("vessels", "nodules", "fissures"):
+            one, other = _array_of(before, name), _array_of(images, name)
+            if one is not other:
+                found |= np.not_equal(False if one is None else one, False if other is None else other)
+        return window(*bounds(found))
+
+
+def _array_of(images: PatientImages, name: str) -> Array | None:
+    volume: Volume | None = getattr(images, name)
+    return None if volume is None else volume.array
 
 
 def _are_same(one: Array | None, other: Array | None) -> bool:
@@ -96,15 +122,22 @@ class WorkingBox:
         self._stop = high + PAD_VOXELS
         self.grid: Grid = grid.crop(self._start, self._stop)
 
-    def cut(self, array: Array) -> Array:
-        """Copy the part of `array` in the box; 0 beyond the image."""
-        out = np.zeros(self.grid.shape, dtype=array.dtype, order="F")
-        source = tuple(
-            slice(max(a, 0), min(b, n)) for a, b, n in zip(self._start, self._stop, array.shape, strict=True)
-        )
-        target = tuple(slice(s.start - a, s.stop - a) for s, a in zip(source, self._start, strict=True))
-        out[target] = array[source]
+    def cut(self, array: Array, part: Window | None = None) -> Array:
+        """Copy what of `array` lies in the box, or in a window of it; 0 beyond the image."""
+        part = part or window(np.zeros(3, dtype=np.int64), np.array(self.grid.shape))
+        start = self._start + [axis.start for axis in part]
+        out = np.zeros([axis.stop - axis.start for axis in part], dtype=array.dtype, order="F")
+        low, high = np.maximum(start, 0), np.minimum(start + out.shape, array.shape)
+        out[window(low - start, high - start)] = array[window(low, high)]
         return out
+
+    def window(self, part: Window) -> Window:
+        """Return what of a window of the image lies in the box, as a window of the box."""
+        low, high = (
+            np.clip([getattr(axis, end) for axis in part] - self._start, 0, self.grid.shape)
+            for end in ("start", "stop")
+        )
+        return window(low, np.maximum(low, high))
 
 
 def build_lung(
@@ -145,11 +178,15 @@ def build_lung(
     lumen = images.lumen
     tree: AirwayTree = reused.get("tree", (lumen.array,), lambda: tree_from_mask(lumen))
     tell("labels")
-    box = WorkingBox(images.lung.array | images.lumen.array, images.grid)
-    labels, lungs_lps = _labels(images, box, tree, warnings, reused)
-    labels = keep("labels", labels)
+    lung, wall = images.lung.array, _array_of(images, "wall")
+    box = reused.get("box", (lung, lumen.array), lambda: WorkingBox(lung | lumen.array, images.grid))
+    sides = reused.get("sides", (lung, lumen.array, wall), lambda: _sides(images, box))
+    changed = reused.changed(images)
+    changed = None if changed is None else box.window(changed)
+    labels = keep("labels", _labels(images, box, tree, sides, reused, changed))
+    warnings += _warnings(images, sides)
     tell("plausibility of the masks")
-    findings = with_accepted(mask_findings(images, tree, lungs_lps), images.accepted)
+    findings = with_accepted(mask_findings(images, tree, sides.points_lps, reused.get), images.accepted)
     motion = None
     if images.motion is not None:
         from anatomy.motion.prepare import prepare_motion
@@ -167,8 +204,14 @@ def build_lung(
         grid=box.grid,
         labels=labels,
         fields=clearance_fields(
-            labels, box.grid, fissures=images.fissures is not None, keep=keep, tell=tell, reused=reused
-        ),
+            labels,
+            box.grid,
+            fissures=images.fissures is not None,
+            keep=keep,
+            tell=tell,
+            before=None if changed is None else reused.lung,
+            changed=changed,
+        ),  # fmt: skip
         lumen_depth=replace(depth, corners=keep("lumen_depth.corners", depth.corners)),
         tree=tree,
         motion=motion,
@@ -179,59 +222,91 @@ def build_lung(
     )
 
 
-def _labels(
-    images: PatientImages, box: WorkingBox, tree: AirwayTree, warnings: list[str], reused: Reused
-) -> tuple[UInt16, tuple[Float, Float]]:
-    """Set the bits of every structure and the branch of airway voxels; also return points of both lungs."""
-    lumen = box.cut(images.lumen.array)
-    airway = lumen if images.wall is None else lumen | box.cut(images.wall.array)
-    if images.wall is None:
-        warnings.append("No airway wall mask: the wall is covered by the margins alone.")
-    vessels = box.cut(images.vessels.array)
-    overlap = int((vessels & lumen).sum())
-    if overlap:
-        warnings.append(f"{overlap} voxels were both airway lumen and vessel; they are kept as lumen.")
-        vessels &= ~lumen
-    lung = box.cut(images.lung.array)
-    inside = lung | airway | vessels
-    if images.nodules is not None:
-        inside |= box.cut(images.nodules.array)
-    labels = np.zeros(box.grid.shape, dtype=np.uint16, order="F")
-    labels[~inside] = structures.OUTSIDE
-    structures.close_border(labels)
-    tissue = lung & ~airway
-    sides: tuple[Int32, tuple[int, ...]] | None = reused.get(
-        "sides", (tissue,), lambda: coarse_sides(tissue, box.grid)
-    )
+@frozen_record
+class _Sides:
+    """The left and the right lung: points `(N, 3)` LPS mm of both, and the septum where they touch.
+
+    The septum is None, and there are no points, if the lungs cannot be told apart.
+    """
+
+    points_lps: tuple[Float, Float]
+    septum: Mask | None
+
+
+def _sides(images: PatientImages, box: WorkingBox) -> _Sides:
+    tissue = images.lung.array & ~images.lumen.array
+    if images.wall is not None:
+        tissue &= ~images.wall.array
+    tissue = box.cut(tissue)
+    sides = coarse_sides(tissue, box.grid)
     if sides is None:
-        warnings.append("The mask could not be split into two lungs: taken as one lung.")
+        return _Sides(points_lps=(np.zeros((0, 3)), np.zeros((0, 3))), septum=None)
+    return _Sides(points_lps=points_of_sides(*sides, box.grid), septum=border_of(*sides, tissue))
+
+
+def _warnings(images: PatientImages, sides: _Sides) -> Iterator[str]:
+    """Yield what labels make of masks that are not as they should be."""
+    if images.wall is None:
+        yield "No airway wall mask: the wall is covered by the margins alone."
+    overlap = int(np.count_nonzero(images.vessels.array & images.lumen.array))
+    if overlap:
+        yield f"{overlap} voxels were both airway lumen and vessel; they are kept as lumen."
+    if sides.septum is None:
+        yield "The mask could not be split into two lungs: taken as one lung."
+    elif sides.septum.any():
+        count = int(np.count_nonzero(sides.septum))
+        yield f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
+
+
+def _labels(
+    images: PatientImages,
+    box: WorkingBox,
+    tree: AirwayTree,
+    sides: _Sides,
+    reused: Reused,
+    changed: Window | None,
+) -> UInt16:
+    """Return the labels: those of before but for the window that has changed, if that is known."""
+    if changed is not None and reused.lung is not None:
+        labels = np.array(reused.lung.labels, order="F")
+        airway = labels[changed] & ~np.uint16(structures.VESSEL | structures.FISSURE | structures.OUTSIDE)
+        labels[changed] = airway | _without_airway(images, box, sides, changed)
     else:
-        septum = border_of(*sides, tissue)
-        count = int(septum.sum())
-        if count:
-            warnings.append(
-                f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
-            )
-        labels[septum] |= structures.OUTSIDE
-    labels[vessels] |= structures.VESSEL
+        labels = _without_airway(images, box, sides)
+        at, codes = _airway_codes(images, box, tree)
+        labels[at] |= codes
+    structures.close_border(labels)
+    return labels
+
+
+def _without_airway(
+    images: PatientImages, box: WorkingBox, sides: _Sides, part: Window | None = None
+) -> UInt16:
+    """Return what labels say of vessels, fissures and the outside, in a window of the box."""
+
+    def cut(name: str) -> Mask:
+        return box.cut(getattr(images, name).array, part)
+
+    lumen = cut("lumen")
+    airway = lumen if images.wall is None else lumen | cut("wall")
+    vessels = cut("vessels") & ~lumen
+    outside = ~(cut("lung") | airway | vessels)
+    if images.nodules is not None:
+        outside &= ~cut("nodules")
+    if sides.septum is not None:
+        outside |= sides.septum if part is None else sides.septum[part]
+    labels: UInt16 = outside * np.uint16(structures.OUTSIDE)
+    labels |= vessels * np.uint16(structures.VESSEL)
     if images.fissures is not None:
-        fissures = box.cut(images.fissures.array)
+        fissures = cut("fissures")
         if images.fissure_band is not None:
-            band = box.cut(images.fissure_band.array)
+            band = cut("fissure_band")
             fissures |= (band > 0) & (band < UNKNOWN)
-        fissures &= ~airway
-        labels[fissures] |= structures.FISSURE
-    at, codes = reused.get(
-        "branches",
-        (airway, lumen, box.grid.lps_from_ijk),
-        lambda: _airway_codes(airway, lumen, tree, box.grid),
-    )
-    labels[at] |= codes
-    empty = np.zeros((0, 3))
-    return labels, (empty, empty) if sides is None else points_of_sides(*sides, box.grid)
+        labels |= (fissures & ~airway) * np.uint16(structures.FISSURE)
+    return labels
 
 
-def _airway_codes(airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> tuple[tuple[Int, ...], UInt16]:
+def _airway_codes(images: PatientImages, box: WorkingBox, tree: AirwayTree) -> tuple[tuple[Int, ...], UInt16]:
     """Return where airways are and what labels say there: AIRWAY, LUMEN and the branch.
 
     It is of the branches nearest by their centreline the one nearest by its surface.
@@ -242,9 +317,10 @@ def _airway_codes(airway: Mask, lumen: Mask, tree: AirwayTree, grid: Grid) -> tu
             expected=f"at most {structures.MAX_BRANCHES}",
             remedy="Remove noise from the airway mask",
         )
-    voxels = np.argwhere(airway)
+    lumen = box.cut(images.lumen.array)
+    voxels = np.argwhere(lumen if images.wall is None else lumen | box.cut(images.wall.array))
     # Centreline points that are looked at to find the branch of an airway voxel.
-    distance, index = tree.nearest_point_index.query(grid.lps(voxels), k=min(8, tree.n_points))
+    distance, index = tree.nearest_point_index.query(box.grid.lps(voxels), k=min(8, tree.n_points))
     distance, index = distance.reshape(len(voxels), -1), index.reshape(len(voxels), -1)
     nearest = np.argmin(distance - tree.radius_mm[index], axis=1)
     branch = tree.branch_of_point[index[np.arange(len(voxels)), nearest]]
@@ -260,42 +336,61 @@ def clearance_fields(
     fissures: bool = False,
     keep: Keep = lambda _name, array: array,
     tell: Progress = lambda _step: None,
-    reused: Reused | None = None,
+    before: Lung | None = None,
+    changed: Window | None = None,
 ) -> dict[str, DistanceField]:
     """Return the fields of the clearance to each structure and to all of them, by name.
 
-    `labels` `(ni, nj, nk)` are those of `anatomy.structures`; there are fields of fissures if these are
-    known.  `keep`, `tell` and `reused` are `keep`, `progress` and `reused` of `build_lung`.
+    Args:
+        labels: `(ni, nj, nk)`, those of `anatomy.structures`.
+        fissures: Whether fissures are known; then there are fields of them.
+        keep, tell: `keep` and `progress` of `build_lung`.
+        before: A lung whose labels, on the same grid, differ in the window `changed` alone.
     """
-    geometry = corner_geometry(grid)
-    return {
-        name: DistanceField(name=name, corners=keep(f"fields.{name}.corners", corners), geometry=geometry)
-        for name, corners in _field_arrays(labels, grid, fissures, tell, reused or Reused())
-    }
+    known = {} if before is None or changed is None else before.fields
+    whole, geometry = window(np.zeros(3, dtype=np.int64), np.array(grid.shape) + 1), corner_geometry(grid)
+    fields: dict[str, DistanceField] = {}
+    differs: dict[str, Window | None] = {}
 
+    def add(name: str, corners: UInt16, box: Window | None) -> None:
+        """Add a field, and note in which corners it is another one than before."""
+        kept = keep(f"fields.{name}.corners", corners)
+        fields[name] = DistanceField(name=name, corners=kept, geometry=geometry)
+        differs[name] = box
 
-def _field_arrays(
-    labels: UInt16, grid: Grid, has_fissures: bool, tell: Progress, reused: Reused
-) -> Iterator[tuple[str, UInt16]]:
-    """Yield the clearance fields one after the other; the unions are minima of the parts."""
-    union: UInt16 = np.full(tuple(n + 1 for n in grid.shape), MAX_STORED, dtype=np.uint16, order="F")
-
-    def corners_of(name: str) -> UInt16:
+    def add_single(name: str) -> None:
         tell(f"clearance to {name}")
-        solid = (labels & structures.FIELD_BITS[name]) != 0
-        return np.asarray(
-            reused.get(name, (solid, grid.spacing_mm), lambda: distance_corners(solid, grid.spacing_mm))
-        )
+        bits = structures.FIELD_BITS[name]
+
+        def solid(part: Window) -> Mask:
+            return np.asarray((labels[part] & bits) != 0)
+
+        if name not in known or before is None or changed is None:
+            add(name, distance_corners(solid(whole), grid.spacing_mm), whole)
+        elif np.array_equal(solid(changed), (before.labels[changed] & bits) != 0):
+            add(name, known[name].corners, None)
+        else:
+            add(name, *renewed_corners(known[name].corners, solid, changed, grid.spacing_mm))
+
+    def add_union(name: str, *parts: str) -> None:
+        boxes = [box for part in parts if (box := differs[part]) is not None]
+        if name in known and not boxes:
+            add(name, known[name].corners, None)
+            return
+        first, box = fields[parts[0]].corners, hull(boxes)
+        corners = np.array(known[name].corners if name in known else first, order="F")
+        corners[box] = first[box]
+        for part in parts[1:]:
+            np.minimum(corners[box], fields[part].corners[box], out=corners[box])
+        add(name, corners, box)
 
     for name in SINGLE_FIELDS[:3]:
-        corners = corners_of(name)
-        np.minimum(union, corners, out=union)
-        yield name, corners
-    yield "obstacle", union
-    if has_fissures:
-        corners = corners_of("fissure")
-        yield "fissure", corners
-        yield "obstacle_fissure", np.minimum(union, corners)
+        add_single(name)
+    add_union("obstacle", *SINGLE_FIELDS[:3])
+    if fissures:
+        add_single("fissure")
+        add_union("obstacle_fissure", "obstacle", "fissure")
+    return fields
 
 
 def _depth_of(lumen: Volume) -> DistanceField:

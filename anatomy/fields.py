@@ -6,16 +6,18 @@ corners that touch the structure: exact, with voxels as solid boxes and any voxe
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from anatomy.base.errors import GridMismatchError
 from anatomy.base.records import frozen_record
-from anatomy.base.typed import Float, Mask, UInt16
+from anatomy.base.typed import Float, Int, Mask, UInt16
 from anatomy.grid import Grid, read_only
 from anatomy.kernels import field as kernel
 from anatomy.kernels.distance import NONE, fill_distances
+from anatomy.morphology import Window, bounds, window
 
 MAX_STORED = NONE
 """Distances from this on, 256 mm, are stored as it: no device looks so far."""
@@ -113,6 +115,92 @@ def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOL
         )
     fill_distances(near, squares, shift)
     return near
+
+
+def renewed_corners(
+    before: UInt16, solid: Callable[[Window], Mask], changed: Window, spacing_mm: ArrayLike
+) -> tuple[UInt16, Window]:
+    """Return what `distance_corners` makes of a mask of which a window has changed, and where it differs.
+
+    Args:
+        before: Distances before the change.
+        solid: Returns the voxels of a window of the mask.
+
+    Returns:
+        - (UInt16, Window) - The distances, and a box of corners beyond which they are those of before.
+    """
+    spacing, shape = np.asarray(spacing_mm, dtype=np.float64), np.array(before.shape)
+    first, last = (np.array([getattr(axis, end) for axis in changed]) for end in ("start", "stop"))
+    low, high = _reach_of_change(before, first, last, spacing)
+    box, inner = window(low, high), window(first - low, last + 1 - low)
+    corners: UInt16 = np.array(before, order="F")
+    part = corners[box]
+    start = np.maximum(first - 1, 0)
+    around = touched_corners(solid(window(start, np.minimum(last + 1, shape - 1))))
+    touched = around[window(first - start, last + 1 - start)]
+    points = np.zeros(part.shape, dtype=np.bool_, order="F")
+    points[inner] = (part[inner] == 0) & ~touched
+    if points.any():
+        # Corners to which one that is gone was the nearest are measured anew.
+        start, stop = bounds(distance_corners(points, spacing, CENTRES) <= part)
+        part[window(start, stop)] = _distances_in(low + start, low + stop, before, solid, spacing)
+    points[inner] = touched
+    np.minimum(part, distance_corners(points, spacing, CENTRES), out=part)
+    return corners, box
+
+
+def _reach_of_change(before: UInt16, first: Int, last: Int, spacing: Float) -> tuple[Int, Int]:
+    """Return the first and the last but one of the corners beyond which a change makes no difference.
+
+    Let `p` lie outside a box around the change, and let the obstacle that is nearest to it before or after,
+    but not both, lie in the change.  Where the straight line between the two leaves the box, the change is as
+    near as the nearest obstacle before.  So a box holds all that differs if on its faces the change is
+    farther, by a diagonal of a voxel for the way to the next corner and back.
+    """
+    shape, diagonal = np.array(before.shape), float(np.linalg.norm(spacing))
+    pads = np.full((2, 3), 8)
+    while True:
+        low, high = np.maximum(first - pads[0], 0), np.minimum(last + pads[1] + 1, shape)
+        squares = [
+            (np.maximum(np.maximum(a - at, at - b), 0) * side) ** 2
+            for a, b, at, side in zip(first, last, map(np.arange, low, high), spacing, strict=True)
+        ]
+        wider = np.zeros((2, 3), dtype=np.bool_)
+        for axis, end in np.ndindex(3, 2):
+            at = (low[axis], high[axis] - 1)[end]
+            if 0 < at < shape[axis] - 1:
+                face = [slice(a, b) for a, b in zip(low, high, strict=True)]
+                face[axis] = slice(at, at + 1)
+                i, j, k = (
+                    each[cut.start - a : cut.stop - a]
+                    for each, cut, a in zip(squares, face, low, strict=True)
+                )
+                away = np.sqrt(i[:, None, None] + j[:, None] + k)
+                wider[end, axis] = (away <= _most_mm(before[tuple(face)]) + diagonal).any()
+        if not wider.any():
+            return low, high
+        pads += wider * (pads // 2)
+
+
+def _distances_in(
+    low: Int, high: Int, before: UInt16, solid: Callable[[Window], Mask], spacing: Float
+) -> UInt16:
+    """Return the distances at corners of a box, from as much of the mask as may be nearest to one of them."""
+    last = np.array(before.shape) - 1
+    reach_mm = float(_most_mm(before[window(low, high)].max()))
+    while True:
+        pad = np.ceil(reach_mm / spacing).astype(np.int64) + 1
+        start, stop = np.maximum(low - pad, 0), np.minimum(high - 1 + pad, last)
+        found = distance_corners(solid(window(start, stop)), spacing)[window(low - start, high - start)]
+        most_mm = float(_most_mm(found.max()))
+        if most_mm <= reach_mm:
+            return found
+        reach_mm = most_mm
+
+
+def _most_mm(stored: ArrayLike) -> Float:
+    """Return the most that stored distances stand for, mm."""
+    return (np.asarray(stored, dtype=np.float64) + 2.0) / kernel.UNITS_PER_MM
 
 
 def distance_field(name: str, mask: Mask, grid: Grid, half_voxels: float = SOLID) -> DistanceField:

@@ -1,6 +1,7 @@
 """Figures of the masks of a patient, each by itself and beside the others."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from anatomy.lobes import LOBES, RIGHT_LOWER
 from anatomy.patient import PatientImages
 from anatomy.plausibility import DOUBTFUL, REFUSED, Finding, findings_of
 
+Kept = Callable[[str, tuple[Array | None, ...], Callable[[], Any]], Any]
 AROUND = np.vstack([np.eye(3), -np.eye(3)])
 """Directions in which what lies around a point is looked for."""
 LEAST_CUT, GREATEST_CUT = 0.01, 0.1
@@ -23,22 +25,25 @@ phantoms a segment and all behind it has 2 to 5 %, what hangs on a main bronchus
 
 
 def mask_findings(
-    images: PatientImages, tree: AirwayTree, lungs_lps: tuple[Float, Float]
+    images: PatientImages,
+    tree: AirwayTree,
+    lungs_lps: tuple[Float, Float],
+    kept: Kept = lambda _name, _sources, make: make(),
 ) -> tuple[Finding, ...]:
     """Check the masks of a patient by all figures of `anatomy.plausibility.LIMITS`, and by their directions.
 
     `lungs_lps` are points `(N, 3)` spread evenly over the left and the right lung, LPS mm, empty if they
     cannot be told apart.  Every check is returned, what is usual included; those that `images.accepted` names
-    are accepted.
+    are accepted.  `kept` is `anatomy.build.Reused.get`.
     """
-    found = findings_of(dict(_figures(images, tree)))
+    found = findings_of(dict(_figures(images, tree, kept)))
     found += _cut_off(images, tree)
     found += directions(tree, *lungs_lps, lowest_mm=float(images.grid.corners_lps[:, 2].min()))
     found += [Finding(name="airway", found=said, verdict=DOUBTFUL) for said in tree.report.warnings]
     return tuple(found)
 
 
-def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, float]]:
+def _figures(images: PatientImages, tree: AirwayTree, kept: Kept) -> Iterator[tuple[str, float]]:
     """Yield the figures that can be told, by the names of `anatomy.plausibility.LIMITS`."""
     ml = images.grid.voxel_volume_mm3 / 1000.0
     lung, lumen, vessels = images.lung.array, images.lumen.array, images.vessels.array
@@ -48,7 +53,7 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     yield from _of_lungs(lung, {"vessels": vessels, "fissures": everywhere}, images.grid, tree)
     yield "lungs_l", _count(lung) * ml / 1000.0
     yield "lumen_ml", _count(lumen) * ml
-    yield "lumen_end_mm2", _lowest_mm2(lumen, images.grid)
+    yield "lumen_end_mm2", kept("end of the lumen", (lumen,), lambda: _lowest_mm2(lumen, images.grid))
     yield "lumen_holes", tree.report.cavity_voxels / _count(lumen)
     yield from _of_airway(lung, images.grid, tree)
     inside = vessels & lung
@@ -56,13 +61,14 @@ def _figures(images: PatientImages, tree: AirwayTree) -> Iterator[tuple[str, flo
     yield "vessels_in_lungs", _count(inside) / _count(vessels)
     yield "vessels_in_lumen", _shared(vessels, lumen)
     if images.wall is not None:
-        yield "wall_in_lumen", _shared(images.wall.array, lumen)
-        yield "wall_in_vessels", _shared(images.wall.array, vessels)
-        yield "wall_at_lumen", share_at_lumen(images.wall.array, lumen, images.grid)
+        wall = images.wall.array
+        yield "wall_in_lumen", _shared(wall, lumen)
+        yield "wall_in_vessels", _shared(wall, vessels)
+        near = kept("wall at the lumen", (wall, lumen), lambda: share_at_lumen(wall, lumen, images.grid))
+        yield "wall_at_lumen", near
         # How much of the airway has a wall, in the part that has the least.
         around = (
-            _around(images.wall.array, images.grid, tree.points_lps, tree.radius_mm + by).any(1)
-            for by in (0, 0.5, 1, 2)
+            _around(wall, images.grid, tree.points_lps, tree.radius_mm + by).any(1) for by in (0, 0.5, 1, 2)
         )
         yield "least_wall", min(_shares_of_parts(np.any(list(around), 0), tree.points_lps, tree))
     if fissures is not None:

@@ -109,7 +109,7 @@ def _require_cost(cost: Volume, grid: Grid) -> None:
     values = cost.array
     if values.dtype != np.float32:
         raise AnatomyError(f"The cost map has the type {values.dtype}", expected="float32 voxels")
-    allowed = ((values >= 0) & (values <= 1)) | np.isposinf(values)
+    allowed = (values >= 0) & ((values <= 1) | (values == np.inf))
     if not allowed.all():
         n_wrong, first = np.count_nonzero(~allowed), values[~allowed][0]
         raise AnatomyError(

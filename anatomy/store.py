@@ -107,6 +107,8 @@ def _build_into(
             remedy="Delete that folder",
             expected="files as lungaccess wrote them",
         )
+    if reused is not None:
+        reused.take(images, lung)
     return lung
 
 

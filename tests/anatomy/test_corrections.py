@@ -135,7 +135,7 @@ def test_a_corrected_lung_is_the_same_however_little_of_it_is_made_again(
 ) -> None:
     images = small_phantom.images
     first = build_lung(images)
-    reused = Reused.of(images, first)
+    reused = Reused(images, first)
     assert_same(build_lung(images, reused=reused), first)
     edge = images.lumen.array if code == TISSUE else images.lung.array
     for size in (1, 2):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from anatomy.base.errors import GridMismatchError
-from anatomy.fields import MAX_STORED, corner_geometry, distance_corners, distance_field, touched_corners
+from anatomy.fields import (
+    CENTRES,
+    MAX_STORED,
+    corner_geometry,
+    distance_corners,
+    distance_field,
+    renewed_corners,
+    touched_corners,
+)  # fmt: skip
 from anatomy.fields import DistanceField as Field
 from anatomy.grid import Grid
 from anatomy.kernels.field import UNITS_PER_MM, distance_estimate
+from anatomy.morphology import window
 from tests.anatomy.boxes import Scene, boxes_mm, edge_mm, in_grid_mm, scenes
 
 # Distances are stored in these steps, after a little has been taken off for the rounding of places.
@@ -114,6 +124,48 @@ def test_voxels_that_are_too_flat_for_exact_distances_are_refused() -> None:
     for shape, spacing in (((3, 4, 5), (300.0, 1.0, 1.0)), ((9000, 1, 1), (1.0, 1.0, 1.0))):
         with pytest.raises(GridMismatchError, match="voxels of"):
             distance_corners(np.ones(shape, dtype=bool, order="F"), spacing)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    shape=st.tuples(st.integers(1, 50), st.integers(1, 50), st.integers(1, 50)),
+    spacing=st.tuples(st.floats(0.3, 3.0), st.floats(0.3, 3.0), st.floats(0.3, 3.0)),
+    share=st.sampled_from([0.0, 1e-4, 1e-3, 0.02, 0.5]),
+)
+def test_a_field_that_is_renewed_where_a_mask_has_changed_is_that_of_the_whole_mask(
+    seed: int, shape: tuple[int, ...], spacing: tuple[float, ...], share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.asfortranarray(rng.uniform(size=shape) < share)
+    corners = distance_corners(mask, spacing)
+    for _ in range(4):
+        before = corners
+        middle, half = rng.integers(shape), rng.integers(0, 4, 3)
+        changed = window(np.maximum(middle - half, 0), np.minimum(middle + half + 1, shape))
+        part = mask[changed]
+        # Painted, erased, both, or nothing.
+        part[...] = rng.uniform(size=part.shape) < rng.choice([0.0, 1.0, 0.3])
+        corners, box = renewed_corners(before, lambda cut: mask[cut], changed, spacing)
+        assert np.array_equal(corners, distance_corners(mask, spacing))
+        differs = corners != before
+        differs[box] = False
+        assert not differs.any()
+
+
+def test_distances_are_the_least_of_all_in_whole_numbers() -> None:
+    """A box of the grid has the very numbers of the whole: nothing depends on the order of the sums."""
+    rng = np.random.default_rng(4)
+    spacing = np.array([0.703125, 0.703125, 1.25])
+    for count in (1, 7, 300):
+        points = np.unique(rng.integers(0, (40, 30, 20), (count, 3)), axis=0)
+        mask = np.zeros((40, 30, 20), dtype=bool, order="F")
+        mask[tuple(points.T)] = True
+        index = np.stack(np.meshgrid(*map(np.arange, mask.shape), indexing="ij"), axis=-1)
+        steps = (index[..., None, :] - points).astype(np.int64)
+        squares = np.floor((spacing * 2.0**16) ** 2 * (1.0 - 2.0**-32)).astype(np.int64)
+        least = (steps**2 * squares).sum(axis=-1).min(axis=-1)
+        exact = np.array([math.isqrt(each) >> 8 for each in least.ravel().tolist()]).reshape(mask.shape)
+        assert np.array_equal(distance_corners(mask, spacing, CENTRES), exact)
 
 
 def test_no_structure_is_as_far_as_can_be_told() -> None:

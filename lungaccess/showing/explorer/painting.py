@@ -58,7 +58,7 @@ class Painting:
             kept = read_corrections(file)
             values = place(kept.array, kept.grid, made.grid).array
         images = corrected(made, source.patient)
-        return cls(source=source, made=made, images=images, values=values, reused=Reused.of(images, lung))
+        return cls(source=source, made=made, images=images, values=values, reused=Reused(images, lung))
 
     def draw(self, question: PaintQuestion, ct: Callable[[], Volume]) -> float:
         """Correct what a stroke means, and return how many ml it changes; a fill and a bridge need the CT.

@@ -61,11 +61,11 @@ def with_corrections(
         numbers[(values == NODULE) & (numbers == 0)] = int(labels.array.max()) + 1
         made["nodule_labels"] = _with_part(labels, box, numbers, labels.grid)
     if images.cost is not None:
-        cost = images.cost.array[box].copy()
-        opened = changed & np.isinf(cost) & ~after["vessels"] & ~after["lumen"]
+        opened = changed & ~after["vessels"] & ~after["lumen"]
+        opened[opened] = np.isinf(images.cost.array[box][opened])
         if opened.any():
             # What was taken for an obstacle costs as much to pass as any tissue.
-            cost[opened] = np.float32(1.0)
+            cost = np.where(opened, np.float32(1.0), images.cost.array[box])
             made["cost"] = _with_part(images.cost, box, cost, images.grid)
     warnings = (*images.warnings, *_warnings(images.grid, before, after), *UNUSED[:unused])
     return replace(images, **made, warnings=warnings, sources=sources)
@@ -123,7 +123,7 @@ def _wall(wall: Mask, before: Mask, after: Mask, changed: Mask, grid: Grid) -> M
 def _warnings(grid: Grid, before: Mapping[str, Mask], after: Mapping[str, Mask]) -> list[str]:
     words = []
     for name, role in ROLES.items():
-        if role not in after:
+        if role not in after or np.array_equal(before[role], after[role]):
             continue
         more, less = after[role] & ~before[role], before[role] & ~after[role]
         said = [

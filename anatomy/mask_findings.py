@@ -38,7 +38,9 @@ def mask_findings(
     """
     found = findings_of(dict(_figures(images, tree, kept)))
     found += _cut_off(images, tree)
-    found += directions(tree, *lungs_lps, lowest_mm=float(images.grid.corners_lps[:, 2].min()))
+    lowest_mm = float(images.grid.corners_lps[:, 2].min())
+    sources = images.lumen.array, *lungs_lps
+    found += kept("directions", sources, lambda: directions(tree, *lungs_lps, lowest_mm=lowest_mm))
     found += [Finding(name="airway", found=said, verdict=DOUBTFUL) for said in tree.report.warnings]
     return tuple(found)
 
@@ -50,7 +52,8 @@ def _figures(images: PatientImages, tree: AirwayTree, kept: Kept) -> Iterator[tu
     fissures = None if images.fissures is None else images.fissures.array
     # A band says itself where fissures are not known; an inferred oblique fissure may begin below the apex.
     everywhere = fissures if images.fissure_band is None else None
-    yield from _of_lungs(lung, {"vessels": vessels, "fissures": everywhere}, images.grid, tree)
+    points = kept("points of the lungs", (lung,), lambda: morphology.sampled(lung, images.grid, SAMPLE_MM))
+    yield from _of_lungs(lung, points, {"vessels": vessels, "fissures": everywhere}, images.grid, tree)
     yield "lungs_l", _count(lung) * ml / 1000.0
     yield "lumen_ml", _count(lumen) * ml
     yield "lumen_end_mm2", kept("end of the lumen", (lumen,), lambda: _lowest_mm2(lumen, images.grid))
@@ -100,7 +103,9 @@ def _figures(images: PatientImages, tree: AirwayTree, kept: Kept) -> Iterator[tu
                 named = np.stack([images.nodule_labels.array[tuple(voxels.T)], part], axis=1)
                 yield "nodule_pieces", float(np.bincount(np.unique(named, axis=0)[:, 0]).max())
     if images.lobes is not None:
-        yield from _of_lobes(images.lobes.array, lung, images.grid, tree)
+        lobes = images.lobes.array
+        sources = lobes, lung, images.lumen.array
+        yield from kept("lobes", sources, lambda: tuple(_of_lobes(lobes, lung, images.grid, tree)))
 
 
 def _count(mask: Mask) -> float:
@@ -136,7 +141,7 @@ def _shares_of_parts(marks: Mask, points: Float, tree: AirwayTree) -> list[float
 
 
 def _of_lungs(
-    lung: Mask, others: Mapping[str, Mask | None], grid: Grid, tree: AirwayTree
+    lung: Mask, points: Float, others: Mapping[str, Mask | None], grid: Grid, tree: AirwayTree
 ) -> Iterator[tuple[str, float]]:
     """Yield what about one voxel in every cube of `SAMPLE_MM` tells of the lungs."""
     from scipy import ndimage
@@ -149,7 +154,6 @@ def _of_lungs(
     yield "lung_pieces", float(sizes[sizes < 0.05 * total].sum()) / total
     outside, _ = ndimage.label(~coarse)
     yield "lung_holes", float(np.count_nonzero((outside != outside[0, 0, 0]) & ~coarse)) / total
-    points = morphology.sampled(lung, grid, SAMPLE_MM)
     if len(points):
         wide, _, tall = np.ptp(points, axis=0) + SAMPLE_MM
         yield "tall_lungs", float(tall / wide)

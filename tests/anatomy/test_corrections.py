@@ -144,6 +144,31 @@ def test_a_corrected_lung_is_the_same_however_little_of_it_is_made_again(
     assert_same(build_lung(images, reused=reused), first)
 
 
+def test_strokes_one_after_the_other_make_the_lung_that_is_built_anew(small_phantom: Phantom) -> None:
+    """Each lung is made of the one before: painted, erased, taken back, and painted over something else."""
+    images = small_phantom.images
+    tissue = images.lung.array & ~images.lumen.array & ~images.vessels.array
+    assert images.wall is not None
+    assert images.nodules is not None
+    vessel, free = box_in(images.vessels.array, 4), box_in(tissue & ~images.wall.array, 3)
+    reused = Reused(images, build_lung(images))
+    made: list[tuple[tuple[int, ...], tuple[int, ...], int]] = []
+    for stroke in (
+        (*vessel, TISSUE), (*free, VESSEL), (*box_in(images.nodules.array), TISSUE), (*free, NODULE),
+        (*vessel, FISSURE), (*box_in(images.lumen.array, 1), VESSEL), None,
+    ):  # fmt: skip
+        made = made[:-1] if stroke is None else [*made, stroke]
+        changed = with_corrections(images, at(images, *made))
+        renewed, anew = build_lung(changed, reused=reused), build_lung(changed)
+        assert_same(renewed, anew)
+        for name in ("nodules", "cost", "nodule_labels"):
+            one, other = getattr(renewed, name), getattr(anew, name)
+            assert (one is None) == (other is None)
+            assert one is None or np.array_equal(one.array, other.array)
+        assert renewed.findings == anew.findings
+        reused.take(changed, renewed)
+
+
 def test_corrections_are_kept_with_the_patient(small_phantom: Phantom, tmp_path: Path) -> None:
     write_phantom(small_phantom, tmp_path)
     images, hashes = load_patient(tmp_path), input_hashes(tmp_path)

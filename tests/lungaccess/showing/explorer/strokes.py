@@ -1,4 +1,6 @@
-"""How long a stroke takes until there is another plan: processor time, time by the clock, memory.
+"""How long a stroke takes until it is seen, until there is another plan, and until the plan is final.
+
+Time is that by the clock, and that of the processors; memory is told as well.
 
 Run `python -m tests.lungaccess.showing.explorer.strokes PATIENT --structure vessel`; what was painted is
 taken back at the end.  On a machine that others use, processor time is what counts.
@@ -16,7 +18,7 @@ import numpy as np
 import lungaccess as la
 from experiments.explorer_speed import memory_mb
 from lungaccess.showing.explorer import Explorer, PatientSource
-from tests.lungaccess.showing.explorer.client import Client, with_client
+from tests.lungaccess.showing.explorer.client import LAST, Client, with_client
 from tests.lungaccess.showing.explorer.pictures import processor_s
 
 SYSTEM = "lung-default"
@@ -33,6 +35,12 @@ def places(lung: la.Lung, structure: str, seed: int, count: int) -> np.ndarray:
     return points[rng.integers(len(points), size=count)]
 
 
+def spent_s(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
+    """Return the processor time of the processes that did anything."""
+    spent = {name: round(now - before.get(name, 0.0), 2) for name, now in after.items()}
+    return {name: each for name, each in spent.items() if each >= 0.01}
+
+
 def main() -> None:
     """Read the arguments, paint and show."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -47,25 +55,30 @@ def main() -> None:
     asked = {"target": f"lps:{','.join(f'{value:.1f}' for value in target)}", "what_if": {"system": SYSTEM}}
 
     async def talk(client: Client, explorer: Explorer) -> None:
-        async def timed(words: str, ask: str, **values: Any) -> None:
+        async def timed(words: str, ask: str, first: str = "", **values: Any) -> None:
             def used() -> dict[str, float]:
                 return {
                     name: processor_s([pid]) for name, pid in explorer.processes.items() if pid is not None
                 }
 
             before, began = used(), time.monotonic()
-            last = (await client.ask(ask, **values))[-2][0]
+            number, said, early = await client.send(ask, **values), "", ""
+            while said not in LAST:
+                found = (await client.next())[0]
+                said = found["answer"] if found["id"] == number else said
+                if said == first and not early:
+                    early = f"{first} after {time.monotonic() - began:.1f} s, {spent_s(before, used())}; "
             took = time.monotonic() - began
-            spent = {name: round(after - before.get(name, 0.0), 2) for name, after in used().items()}
+            spent = spent_s(before, used())
             memory = {name: round(memory_mb(explorer.processes[name] or 0)) for name in spent}
-            print(f"| {words} | {last['answer']} | {took:.1f} s | {spent} | {memory} MB |", flush=True)
+            print(f"| {words} | {early}{said} after {took:.1f} s, {spent} s | {memory} MB |", flush=True)
 
         await timed("exits", "prepare", what_if=asked["what_if"])
         await timed("first plan", "plan", **asked)
         for place in places(lung, given.structure, given.seed + 1, given.strokes):
             stroke = {"tool": "paint", "structure": given.structure, "points": [place.tolist()]}
-            await timed("stroke", "paint", **stroke, radius_mm=2.0, what_if=asked["what_if"])
-            await timed("its plan", "plan", **asked)
+            await timed("stroke", "paint", "painted", **stroke, radius_mm=2.0, what_if=asked["what_if"])
+            await timed("its plan", "plan", "plan", **asked)
         for _ in range(given.strokes):
             await client.ask("paint", tool="undo", what_if=asked["what_if"])
 

@@ -178,7 +178,9 @@ class _Cube:
         near = np.exp(-(u**2 + v**2) / (0.55 * self.reach_mm) ** 2)
         terms, weight = _second_order(u, v), near
         for _ in range(SURFACE_STEPS):
-            factors = np.linalg.lstsq(terms * weight[:, None], w * weight, rcond=None)[0]
+            # By the normal equations, which are six for thousands of points.
+            weighted = (terms * (weight**2)[:, None]).T
+            factors = np.linalg.lstsq(weighted @ terms, weighted @ w, rcond=None)[0]
             above = w - terms @ factors
             weight = near * np.where(above > 0.0, 1.0, BELOW_WEIGHT) / np.sqrt(1.0 + above**2)
         u, v, w = np.tensordot(axes.astype(np.float32), self.places, axes=1)

@@ -194,7 +194,7 @@ def outlined(lung: Lung, ct: Volume, point_lps: Float) -> tuple[Lung, dict[str, 
     Raises AnatomyError if there is no nodule that can be told from vessels and chest wall.
 
     Returns:
-        - Lung - The patient as slices are to show it, with this nodule alone; nothing is planned on it.
+        - Lung - What lies around it as slices show it, with this nodule alone; nothing is planned on it.
         - dict - The volume in ml, and the diameter in mm of the ball with that volume.
     """
     box = lung.grid.window(point_lps + np.array([[-OUTLINE_MM], [OUTLINE_MM]]), 0.0)
@@ -205,12 +205,12 @@ def outlined(lung: Lung, ct: Volume, point_lps: Float) -> tuple[Lung, dict[str, 
     except AnatomyError as error:
         remedy = 'Put the cross into its middle, or paint it under "Mend the masks"'
         raise AnatomyError(error.found, expected=error.expected, remedy=remedy) from error
-    nodules = np.zeros(lung.grid.shape, dtype=np.bool_, order="F")
-    nodules[box] = inside
-    labels = np.array(lung.labels, order="F")
-    labels[nodules] &= ~np.array(OUTSIDE | VESSEL, dtype=labels.dtype)
+    labels = np.array(lung.labels[box], order="F")
+    labels[inside] &= ~np.array(OUTSIDE | VESSEL, dtype=labels.dtype)
     volume_mm3 = float(np.count_nonzero(inside)) * grid.voxel_volume_mm3
-    shown = replace(lung, labels=labels, nodules=Volume(grid=lung.grid, array=nodules))
+    nodule = Volume(grid=grid, array=inside)
+    others: dict[str, Any] = dict.fromkeys(("cost", "lobes", "fissure_band", "nodule_labels"))
+    shown = replace(lung, grid=grid, labels=labels, fields={}, nodules=nodule, **others)
     size = {"volume_ml": volume_mm3 / 1000.0, "diameter_mm": (6.0 * volume_mm3 / math.pi) ** (1.0 / 3.0)}
     return shown, size
 

@@ -52,7 +52,10 @@ def main() -> None:
     given: Any = parser.parse_args()
     lung = la.load_patient(given.patient, cache=given.cache)
     target, *_ = places(lung, "vessel", given.seed, 1).tolist()
-    asked = {"target": f"lps:{','.join(f'{value:.1f}' for value in target)}", "what_if": {"system": SYSTEM}}
+    asked: dict[str, Any] = {
+        "target": f"lps:{','.join(f'{value:.1f}' for value in target)}",
+        "what_if": {"system": SYSTEM},
+    }
 
     async def talk(client: Client, explorer: Explorer) -> None:
         async def timed(words: str, ask: str, first: str = "", **values: Any) -> None:

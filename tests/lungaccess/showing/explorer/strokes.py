@@ -47,15 +47,16 @@ def main() -> None:
     parser.add_argument("patient", type=Path)
     parser.add_argument("--structure", default="vessel")
     parser.add_argument("--strokes", type=int, default=5)
+    parser.add_argument("--target", help="lps:x,y,z or the name of a target; else a place that is drawn")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cache", type=Path)
     given: Any = parser.parse_args()
     lung = la.load_patient(given.patient, cache=given.cache)
-    target, *_ = places(lung, "vessel", given.seed, 1).tolist()
-    asked: dict[str, Any] = {
-        "target": f"lps:{','.join(f'{value:.1f}' for value in target)}",
-        "what_if": {"system": SYSTEM},
-    }
+    target = given.target
+    if target is None:
+        point, *_ = places(lung, "vessel", given.seed, 1).tolist()
+        target = f"lps:{','.join(f'{value:.1f}' for value in point)}"
+    asked: dict[str, Any] = {"target": target, "what_if": {"system": SYSTEM}}
 
     async def talk(client: Client, explorer: Explorer) -> None:
         async def timed(words: str, ask: str, first: str = "", **values: Any) -> None:

@@ -48,7 +48,7 @@ def write_files(here: Path) -> None:
         assert main(["template", kind, "--out", str(here / f"{kind}.toml"), "--quiet"]) == 0
     shutil.copy(ROOT / "examples" / "my_device.toml", here / "my-device.toml")
     (here / "study.toml").write_text(STUDY)
-    terminal.set_quiet(False)
+    terminal.set_answers()
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("pages")
     write_files(here)
     assert main(["phantom", "--out", str(here / "PATIENT"), "--quiet"]) == 0
-    terminal.set_quiet(False)
+    terminal.set_answers()
     lung = la.load_patient(here / "PATIENT", cache=here / "cache")
     atlas = la.open_atlas(lung, la.load_system("lung-default"), cache=here / "cache")
     target = la.resolve_target(lung)

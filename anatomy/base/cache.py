@@ -1,7 +1,9 @@
 """Where prepared anatomies are kept, and how large that folder may grow."""
 
+import contextlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from anatomy.base.errors import SettingsError
@@ -15,10 +17,29 @@ DEFAULT_LIMIT = "10GB"
 UNITS = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 
-def default_cache() -> Path:
-    """Return the folder for cached lungs: `$LUNGACCESS_CACHE`, or `lungaccess` in the user's cache."""
+def stated_cache() -> Path | None:
+    """Return the folder for cached lungs that `$LUNGACCESS_CACHE` names; None if it names none."""
     stated = os.environ.get("LUNGACCESS_CACHE")
-    return Path(os.path.expanduser(stated)) if stated else user_cache() / "lungaccess"
+    return Path(os.path.expanduser(stated)) if stated else None
+
+
+@contextlib.contextmanager
+def cache_in(folder: Path | None) -> Iterator[None]:
+    """Let a folder be the stated cache meanwhile, also of processes that start then; as ever if None."""
+    before = os.environ.get("LUNGACCESS_CACHE")
+    if folder is not None:
+        os.environ["LUNGACCESS_CACHE"] = str(folder)
+    try:
+        yield
+    finally:
+        os.environ.pop("LUNGACCESS_CACHE", None)
+        if before is not None:
+            os.environ["LUNGACCESS_CACHE"] = before
+
+
+def default_cache() -> Path:
+    """Return the folder for cached lungs: the stated one, or `lungaccess` in the user's cache."""
+    return stated_cache() or user_cache() / "lungaccess"
 
 
 def user_cache() -> Path:

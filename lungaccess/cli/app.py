@@ -15,16 +15,18 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, Argument, CycloptsError, Group, Parameter, exceptions
 
+from anatomy.base.cache import cache_in
 from anatomy.base.checksums import DamagedCacheWarning
 from anatomy.base.errors import AnatomyError, FileError, LungaccessError
 from anatomy.machine_code.ahead import first_compilation
 from anatomy.machine_code.folders import KernelsNotKeptWarning
 from lungaccess.cli import result_folder, terminal
-from lungaccess.cli.commands.benchmark import benchmark
+from lungaccess.cli.commands.benchmark import benchmark, schema
 from lungaccess.cli.commands.check import check, insert, window
 from lungaccess.cli.commands.devices import design, presets, shapes, tubes
 from lungaccess.cli.commands.exchange import export, stream, template
@@ -93,6 +95,9 @@ for _number, (_title, _commands) in enumerate(GROUPS.items()):
             app.command(_command, group=_group, help_epilogue=epilogue(_command.__name__.replace("_", "-")))
 
 
+WITHOUT_JSON = (completion, schema, template)
+"""Commands that print a script or a file, which no option turns into something else."""
+
 # Cyclopts would end the process by itself.
 app.meta.suppress_keyboard_interrupt = False
 
@@ -100,15 +105,23 @@ app.meta.suppress_keyboard_interrupt = False
 @app.meta.default
 def _run(
     *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    json: bool = False,
+    cache: Path | None = None,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False,
 ) -> int | None:
     """Run a command.
 
     Args:
+        json: Print the answer as JSON instead of text and tables; not for what prints a file or a script.
+        cache: Folder where prepared anatomies are kept for the next command.
         quiet: Print neither results nor progress, only errors and what --json asks for.
     """
-    terminal.set_quiet(quiet)
-    code: int | None = app(words, exit_on_error=False, print_error=False)
+    terminal.set_answers(as_json=json, quiet=quiet)
+    command = app.parse_commands(words)[1][-1].default_command
+    if json and (command is None or command in WITHOUT_JSON):
+        words = (*words, "--json")  # It is refused as an option that is unknown there.
+    with cache_in(cache):
+        code: int | None = app(words, exit_on_error=False, print_error=False)
     return code
 
 
@@ -126,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ExitCode.PIPE_CLOSED
     except OSError as error:
         terminal.give_up_output()
-        return _explain(_unusable(error), as_json=False)
+        return _explain(_unusable(error))
     return code
 
 
@@ -166,55 +179,59 @@ def _answer(words: list[str]) -> int:
     if not words:
         terminal.console.file.write(START_PAGE)
         return ExitCode.OK
-    as_json = asks_json(words)
-    first_compilation.command = next((word for word in words if not word.startswith("-")), "")
+    # Until the words are understood, and where they make no sense.
+    terminal.set_answers(as_json=asks_json(words))
+    command = _command_of(words)
+    first_compilation.command = command.partition(" ")[0]
     try:
         result_folder.protect_files(words)
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        return _explain(usage_error(error), as_json)
+        return _explain(usage_error(error, command))
     except LungaccessError as error:
         error.expected = error.expected or "input that this command can use"
-        named = [word for word in words if not word.startswith("-")][:2]
-        command = next((text for n in (2, 1) if (text := " ".join(named[:n])) in EXAMPLES), "")
         error.remedy = error.remedy or _see_help(command)
-        return _explain(error, as_json)
+        return _explain(error)
     except BrokenPipeError:
         raise
     except MemoryError:
-        return _explain(_TOO_LARGE, as_json)
+        return _explain(_TOO_LARGE)
     except OSError as error:
-        return _explain(_unusable(error), as_json)
+        return _explain(_unusable(error))
     except (KeyboardInterrupt, Exception) as error:
         # Compiled libraries turn an interruption of their loading into an ImportError.
         if isinstance(error, KeyboardInterrupt) or isinstance(error.__cause__, KeyboardInterrupt):
             error_console.print("interrupted")
             return ExitCode.INTERRUPTED
-        return _crashed(error, words, as_json)
+        return _crashed(error, words)
     finally:
         result_folder.held.close()
     return int(code or ExitCode.OK)
 
 
-def _crashed(error: Exception, words: list[str], as_json: bool) -> ExitCode:
+def _command_of(words: Sequence[str]) -> str:
+    """Return the name of the command in a command line, before which options may stand; "" without one."""
+    first = 0
+    while words[first : first + 1] and words[first].startswith("-"):
+        first += 2 if words[first] == "--cache" else 1
+    return " ".join(app.parse_commands(words[first:])[0])
+
+
+def _crashed(error: Exception, words: list[str]) -> ExitCode:
     crash = write_report(error, words, software_version())
     terminal.show_error(crash, title="crash")
-    if as_json:
-        terminal.show_json({"error": crash.to_mapping()})
+    terminal.tell({"error": crash.to_mapping()})
     return ExitCode.CRASHED
 
 
-def _explain(error: LungaccessError, as_json: bool) -> ExitCode:
+def _explain(error: LungaccessError) -> ExitCode:
     """Print an error for people, also as JSON if that is asked for, and return its exit code."""
     if isinstance(error, NoPlan):
-        if as_json:
-            terminal.show_json(no_plan_record(error))
-        else:
-            terminal.show_no_plan(error)
+        terminal.tell(no_plan_record(error))
+        terminal.show_no_plan(error)
         return ExitCode.NEGATIVE
     terminal.show_error(error)
-    if as_json:
-        terminal.show_json({"error": error.to_mapping()})
+    terminal.tell({"error": error.to_mapping()})
     return ExitCode.BAD_INPUT
 
 
@@ -258,10 +275,9 @@ class UsageError(LungaccessError):
     """A command or an option is unknown, missing, or has a value that it cannot have."""
 
 
-def usage_error(error: CycloptsError) -> UsageError:
-    """Return what is wrong with the words of a command line, and which words would be right."""
+def usage_error(error: CycloptsError, command: str) -> UsageError:
+    """Return what is wrong with the words of a command, and which words would be right."""
     error.verbose = False
-    command = " ".join(error.command_chain or ())
     found, expected = _found_and_expected(error)
     found = re.sub(r"\s*Available commands: .*", "", found, flags=re.DOTALL)
     guess = _GUESS.search(found)

@@ -14,7 +14,7 @@ from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from anatomy.base.records import frozen_value
 from anatomy.plausibility import require_known_checks
-from lungaccess.cli import lazy, terminal
+from lungaccess.cli import lazy
 from lungaccess.cli.numbers import Count, NotNegative, Probability, Processes, Seconds, Seed, Whole
 from lungaccess.cli.progress import progress
 from lungaccess.problem.goals import SUCCESS, WINDOW
@@ -64,43 +64,8 @@ STEP_SHARES = {
 
 @Parameter(name="*")
 @frozen_value
-class OutputOptions:
-    """How a command answers.
-
-    Args:
-        json: Print JSON instead of text and tables.
-    """
-
-    json: bool = False
-
-    def tell(self, record: object) -> None:
-        """Print plain values where JSON is asked for, and no text for people after them."""
-        if self.json:
-            terminal.show_json(record)
-            terminal.console.quiet = True
-
-
-@Parameter(name="*")
-@frozen_value
-class CacheOptions(OutputOptions):
-    """How a command answers, and where it keeps what it prepares.
-
-    Args:
-        cache: Folder where the prepared anatomy is kept for the next command.
-    """
-
-    cache: Path | None = None
-
-    def open_atlas(self, lung: lazy.Lung, system: lazy.System) -> lazy.Atlas:
-        """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
-        with progress("enumerating what scope and tubes can do") as shown:
-            return lazy.open_atlas(lung, system, cache=self.cache, progress=shown.share)
-
-
-@Parameter(name="*")
-@frozen_value
-class PatientOptions(CacheOptions):
-    """How a command that reads a patient answers, and what of the masks is overruled.
+class PatientOptions:
+    """How a patient is read.
 
     Args:
         accept: Checks of the masks that fail and are overruled, by the names in the message that refuses
@@ -114,7 +79,7 @@ class PatientOptions(CacheOptions):
 
     def load(self, patient: Path, *, thick_slices: bool = False) -> lazy.Lung:
         """Return a patient's lung; see `load_lung`."""
-        return load_lung(patient, self.cache, thick_slices, self.accept)
+        return load_lung(patient, thick_slices, self.accept)
 
     def load_plan(self, plan: Path, patient: Path) -> tuple[lazy.Plan, lazy.Lung]:
         """Return a plan and the lung that it was made for; PlanFileError if it was made for another."""
@@ -126,7 +91,7 @@ class PatientOptions(CacheOptions):
         """Return a patient's lung or a liver of Med-RAD, and show what is being done; see `load_lung`."""
         accept = self.accept if refuse else None
         if not lazy.is_liver(patient):
-            return load_lung(patient, self.cache, thick_slices, accept)
+            return load_lung(patient, thick_slices, accept)
         with progress(f"reading {patient}"):
             return lazy.load_organ(patient, accept=accept)
 
@@ -419,9 +384,13 @@ def require_map(lung: lazy.Lung, objective: str) -> None:
         )
 
 
-def load_lung(
-    patient: Path, cache: Path | None, thick_slices: bool, accept: tuple[str, ...] | None = ()
-) -> lazy.Lung:
+def open_atlas(lung: lazy.Lung, system: lazy.System) -> lazy.Atlas:
+    """Return the deployment atlas of a system in a lung, and show what is being done meanwhile."""
+    with progress("enumerating what scope and tubes can do") as shown:
+        return lazy.open_atlas(lung, system, progress=shown.share)
+
+
+def load_lung(patient: Path, thick_slices: bool, accept: tuple[str, ...] | None = ()) -> lazy.Lung:
     """Return a patient's lung, and show what is being done meanwhile; None as `accept` refuses no masks.
 
     Raises:
@@ -434,5 +403,5 @@ def load_lung(
         lazy.require_thin_slices(patient)
     with progress(f"reading {patient}") as shown:
         return load_patient(
-            patient, cache=cache, progress=lambda step: shown.step(step, STEP_SHARES.get(step)), accept=accept
+            patient, progress=lambda step: shown.step(step, STEP_SHARES.get(step)), accept=accept
         )

@@ -18,7 +18,7 @@ from anatomy.base.records import frozen_value
 from anatomy.base.words import of_hundred
 from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import Asked, CacheOptions
+from lungaccess.cli.options import Asked
 from lungaccess.cli.progress import SearchDisplay, progress
 from lungaccess.plans.no_plan import NoPlan
 from stages.needle import Objective
@@ -67,7 +67,6 @@ class PlanJob:
     asked: Asked
     target: lazy.StatedTarget
     out: Path
-    output: CacheOptions
     pictures: bool = True
     guide: Panel | None = None
 
@@ -92,7 +91,7 @@ def run_search(
         def on_share(share: float) -> None:
             history.on_progress(lazy.atlas_event(share))
 
-        return lazy.open_atlas(request.lung, system, cache=job.output.cache, progress=on_share)
+        return lazy.open_atlas(request.lung, system, progress=on_share)
 
     best: lazy.Plan | None = None
     with display:
@@ -138,15 +137,14 @@ def plan_and_report(lung: lazy.Lung, job: PlanJob) -> ExitCode:
             target_lps=request.target.lps_mm,
         )
     with progress("looking for what would help"):
-        advice = advised(found, lung, request.errors, request.procedure, job.output.cache, appraisal)
+        advice = advised(found, lung, request.errors, request.procedure, appraisal)
     record = lazy.plan_record(
         found, lung, appraisal, job.out, job.files, [each.to_mapping() for each in advice]
     )
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
-    if not job.output.json:
-        if job.guide is not None:
-            terminal.console.print(job.guide)
-        show_plan(found, lung, appraisal, advice)
+    if job.guide is not None:
+        terminal.console.print(job.guide)
+    show_plan(found, lung, appraisal, advice)
     lazy.cost_over_time_csv(history, job.out / HISTORY_FILE)
     if job.pictures:
         with progress("drawing the plan"):
@@ -157,7 +155,7 @@ def plan_and_report(lung: lazy.Lung, job: PlanJob) -> ExitCode:
         with progress("making the page"):
             options = lazy.PageOptions(cost_over_time=job.out / HISTORY_FILE, advice=advice)
             lazy.plan_page(found, lung, job.out / PAGE_FILE, options)
-    job.output.tell(record)
+    terminal.tell(record)
     terminal.say(f"Written to {job.out}: {', '.join(job.files)}")
     return ExitCode.of(appraisal.accepted)
 
@@ -167,14 +165,13 @@ def advised(
     lung: lazy.Lung,
     errors: lazy.ErrorModel | None,
     procedure: lazy.Procedure | None,
-    cache: Path | None,
     appraisal: lazy.Appraisal | None = None,
 ) -> tuple[lazy.Advice, ...]:
     """Return what would lift the chance of a plan, with the presets whose atlases the cache holds."""
 
     def kept_atlas(system: lazy.System) -> lazy.Atlas | None:
-        is_kept = lazy.atlas_is_kept(lung, system, cache=cache)
-        return lazy.open_atlas(lung, system, cache=cache) if is_kept else None
+        is_kept = lazy.atlas_is_kept(lung, system)
+        return lazy.open_atlas(lung, system) if is_kept else None
 
     known = appraisal or lazy.appraise(plan, lung, errors=errors, procedure=procedure)
     return lazy.advise(

@@ -24,7 +24,13 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\
 
 
 class _Console(Console):
-    """A console on which no text of others is markup or commands; a closed pipe is for others to mind."""
+    """A console on which no text of others is markup or commands; a closed pipe is for others to mind.
+
+    Attributes:
+        as_json: Whether commands tell their answers as JSON, without any text for people.
+    """
+
+    as_json = False
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(markup=False, emoji=False, **settings)
@@ -87,14 +93,20 @@ def prepare_surroundings() -> None:
             stream.reconfigure(errors="lungaccess-plain")
 
 
-def set_quiet(quiet: bool) -> None:
-    """Let commands print neither results nor progress, or let them again; JSON and errors still come."""
-    console.quiet = progress_console.quiet = quiet
+def set_answers(*, as_json: bool = False, quiet: bool = False) -> None:
+    """Let commands answer as JSON or in text, or be quiet: then errors and JSON still come."""
+    console.as_json, console.quiet, progress_console.quiet = as_json, as_json or quiet, quiet
 
 
 def give_up_output() -> None:
     """Send what is still to be printed nowhere: what read standard output has ended."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def tell(record: object) -> None:
+    """Print plain values if JSON is asked for; see `set_answers`."""
+    if console.as_json:
+        show_json(record)
 
 
 def show_json(value: object) -> None:

@@ -76,7 +76,6 @@ def renewed_patient(
 def load_organ(
     path: str | os.PathLike[str],
     *,
-    cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
     accept: Collection[str] | None = (),
 ) -> Organ:
@@ -90,4 +89,4 @@ def load_organ(
     require_known_checks(accept or ())
     if is_liver(Path(path)):
         return build_liver(load_liver(Path(path)))
-    return load_patient(path, cache=cache, progress=progress, accept=accept)
+    return load_patient(path, progress=progress, accept=accept)

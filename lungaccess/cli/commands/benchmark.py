@@ -15,7 +15,7 @@ from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, CountOrNone, Processes, SamplesOrNone, Seconds
-from lungaccess.cli.options import CacheOptions, OutputOptions, PatientOptions, SystemOptions
+from lungaccess.cli.options import PatientOptions, SystemOptions
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import claim_folder
 
@@ -48,7 +48,6 @@ def make(
     phantoms: str | None = None,
     ct: Annotated[bool, Parameter(negative="")] = False,
     tips: bool = True,
-    output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Write the cases as files: masks, targets, devices, and scope tips with the motions that lead there.
 
@@ -63,7 +62,7 @@ def make(
     claim_folder(out, ())
     with progress("making synthetic patients") as shown:
         made = lazy.write_benchmark(out, names_of(phantoms), with_ct=ct, with_tips=tips, progress=shown.step)
-    output.tell({"folder": str(out), "phantoms": [each.name for each in made]})
+    terminal.tell({"folder": str(out), "phantoms": [each.name for each in made]})
     terminal.say(
         f"Written to {out}: {len(made)} phantoms, their queries in case.json, the rules in benchmark.json"
     )
@@ -85,7 +84,6 @@ def run(
     answers: Path | None = None,
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Run methods of lungaccess on the cases, as a study; stop it at any time and start it again.
 
@@ -111,11 +109,9 @@ def run(
         time_s=time_s, **devices_asked,
     )  # fmt: skip
     with progress(NAME) as shown:
-        done = lazy.run_study(
-            study, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
-        )
+        done = lazy.run_study(study, out, scheduler=scheduler, workers=workers, progress=shown.step)
     written = [] if answers is None else _write_answers(out, answers)
-    output.tell(asdict(done) | {"results": str(out), "answers": [str(path) for path in written]})
+    terminal.tell(asdict(done) | {"results": str(out), "answers": [str(path) for path in written]})
     terminal.say(
         f"{done.runs} runs: {done.stored_before} were stored, {done.added} added, {done.failed} could not be "
         f"made. Written to {out}"
@@ -143,7 +139,6 @@ def score(
     certify: CountOrNone = 0,
     only_answered: Annotated[bool, Parameter(negative="")] = False,
     out: Path | None = None,
-    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Score a submission by the independent check alone; exit code 1 if an answer is refused.
 
@@ -162,14 +157,14 @@ def score(
     with progress(f"scoring {handed_in.planner}") as shown:
         scores = list(
             lazy.score_submission(
-                handed_in, folder, cache=output.cache, samples=samples, certify_boxes=certify,
+                handed_in, folder, samples=samples, certify_boxes=certify,
                 only_answered=only_answered, progress=shown.step,
             )
         )  # fmt: skip
     if out is not None:
         lazy.write_scores(scores, out)
     refusals = [each for each in scores if each.status == lazy.REFUSED]
-    _show_sheet(scores, output)
+    _show_sheet(scores)
     for each in refusals:
         terminal.say(f"{each.query} is refused: {each.reason}")
     if out is not None:
@@ -179,10 +174,7 @@ def score(
 
 @synthetic.command(help_epilogue=epilogue(f"benchmark {NAME} sheet"))
 def sheet(
-    *scores: Path,
-    csv: Path | None = None,
-    brief: Annotated[bool, Parameter(negative="")] = False,
-    output: OutputOptions = OutputOptions(),
+    *scores: Path, csv: Path | None = None, brief: Annotated[bool, Parameter(negative="")] = False
 ) -> ExitCode:
     """Print the score sheet of one or several planners.
 
@@ -196,7 +188,7 @@ def sheet(
     rows = [each for path in scores for each in lazy.read_scores(path)]
     if csv is not None:
         lazy.write_sheet(lazy.score_sheet(rows, by_family=not brief), csv)
-    _show_sheet(rows, output, by_family=not brief)
+    _show_sheet(rows, by_family=not brief)
     return ExitCode.OK
 
 
@@ -207,11 +199,11 @@ def schema() -> ExitCode:
     return ExitCode.OK
 
 
-def _show_sheet(scores: list[lazy.Score], output: OutputOptions, *, by_family: bool = True) -> None:
+def _show_sheet(scores: list[lazy.Score], *, by_family: bool = True) -> None:
     lines = lazy.score_sheet(scores, by_family=by_family)
     about = {"benchmark": NAME, "manifest_sha256": lazy.manifest_sha256()}
     refused = {each.query: each.reason for each in scores if each.reason}
-    output.tell({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
+    terminal.tell({**about, "sheet": [asdict(line) for line in lines], "refused": refused})
     terminal.show_wide([terminal.table(f"Scores of {NAME}", lazy.HEADINGS, [line.cells() for line in lines])])
 
 
@@ -238,7 +230,7 @@ def med_rad(
     peer: Path | None = None,
     out: Path | None = None,
     system: SystemOptions = SystemOptions(),
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the needle from each published start to each published target; exit code 1 if none is reached.
 
@@ -262,11 +254,11 @@ def med_rad(
     recorded = None if peer is None else lazy.read_peer(peer)
     if out is not None:
         lazy.require_table_file(out)
-    rows = list(_rows(folder, rules, device, radii, names, range(seeds), budget, output))
+    rows = list(_rows(folder, rules, device, radii, names, range(seeds), budget, masks))
     if out is not None:
         lazy.write_rows(rows, out)
     headings, lines = lazy.summary_rows(rows, recorded)
-    output.tell(
+    terminal.tell(
         {
             "rules": rules,
             "system": device.name if rules == "ours" else None,
@@ -294,13 +286,13 @@ def _rows(
     planners: tuple[str, ...],
     seeds: range,
     budget_s: float,
-    output: PatientOptions,
+    masks: PatientOptions,
 ) -> Iterator[lazy.BenchmarkRow]:
     """Run everything, and say meanwhile what is being run; a patient that cannot be read gets a row."""
     paths = list(lazy.patients_of(folder))
     for path in paths:
         try:
-            pose, patient = _posing(path, rules, device, output)
+            pose, patient = _posing(path, rules, device, masks)
         except LungaccessError as error:
             if len(paths) == 1:
                 raise
@@ -316,10 +308,10 @@ def _rows(
 
 
 def _posing(
-    path: Path, rules: Rules, device: lazy.System, output: PatientOptions
+    path: Path, rules: Rules, device: lazy.System, masks: PatientOptions
 ) -> tuple[lazy.Pose, lazy.Organ | lazy.PatientImages | lazy.LiverImages]:
     if rules == "ours":
-        lung = output.load_organ(path)
+        lung = masks.load_organ(path)
         return lazy.posed_in_lung(lung, device), lung
     from anatomy.io.patients import load_patient
 

@@ -36,7 +36,7 @@ def check(
     out: Path | None = None,
     errors: ErrorOptions = ErrorOptions(),
     everything: Annotated[bool, Parameter(name="--all", negative="")] = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Check a stored plan by independent code; exit code 0 if it is accepted, 1 if it is refused.
 
@@ -55,7 +55,7 @@ def check(
                 expected="an edited curve alone, which is checked with the devices of the plan",
                 remedy="Save the plan with --out, and check that",
             )
-        return _check_curve(plan, patient, curve, out, output, everything=everything)
+        return _check_curve(plan, patient, curve, out, masks, everything=everything)
     if out is not None:
         raise SettingsError(
             "--out is given without --curve",
@@ -66,9 +66,9 @@ def check(
     stored, model = lazy.Plan.load(plan), errors.given()
     device = None if system is None else lazy.load_system(system)
     followed = errors.given_procedure()
-    lung = output.load(patient, thick_slices=True)
+    lung = masks.load(patient, thick_slices=True)
     appraisal = lazy.appraise(stored, lung, errors=model, procedure=followed, system=device)
-    output.tell({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
+    terminal.tell({**appraisal.to_mapping(), **appraisal.check.to_mapping()})
     show_headline(appraisal.headline)
     show_findings(appraisal)
     if everything:
@@ -77,7 +77,7 @@ def check(
 
 
 def _check_curve(
-    plan: Path, patient: Path, text: str, out: Path | None, output: PatientOptions, *, everything: bool
+    plan: Path, patient: Path, text: str, out: Path | None, masks: PatientOptions, *, everything: bool
 ) -> ExitCode:
     saved = lazy.parse_reference(text)
     if saved is None:
@@ -87,12 +87,12 @@ def _check_curve(
             remedy="Write --curve scene.mrml#needle",
         )
     stored, curve = lazy.Plan.load(plan), lazy.read_named_curve(saved)
-    lung = output.load(patient, thick_slices=True)
+    lung = masks.load(patient, thick_slices=True)
     edited = lazy.check_curve(stored, lung, curve)
     report = edited.report
     if out is not None and report.accepted:
         edited.plan.save(out)
-    output.tell({"device": edited.device, "edited": edited.words, **report.to_mapping()})
+    terminal.tell({"device": edited.device, "edited": edited.words, **report.to_mapping()})
     terminal.say(edited.words)
     show_headline(lazy.Headline.of(report, None))
     for finding in (*report.refusals, *report.unchecked):
@@ -112,7 +112,7 @@ def window(
     out: Path | None = None,
     tissue_carries_needle: bool = False,
     picture: Path | None = None,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show in which phases of the breath a plan is proved clear and on target; exit code 1 if in none.
 
@@ -130,7 +130,7 @@ def window(
     for file, suffix in ((out, ".json"), (picture, ".png")):
         if file is not None:
             require_suffix(file, suffix)
-    stored, lung = output.load_plan(plan, patient)
+    stored, lung = masks.load_plan(plan, patient)
     found = lazy.breathing_window(stored, lung, tolerance_mm=tolerance)
     in_place = lazy.carried_needle(stored, lung, found) if tissue_carries_needle else None
     if out is not None:
@@ -138,7 +138,7 @@ def window(
     if picture is not None:
         lazy.window_png(found, picture)
     told = {} if in_place is None else {"needle_in_tissue_not_proved": asdict(in_place)}
-    output.tell({**lazy.plain(found), "share": found.share, "words": found.words, **told})
+    terminal.tell({**lazy.plain(found), "share": found.share, "words": found.words, **told})
     terminal.say(found.words)
     rows = [(f"{of_hundred(a, up=True)} to {percent(b)}", percent(b - a)) for a, b in found.phases.tolist()]
     rows += [("not decided", percent(found.undecided_share))]
@@ -179,7 +179,7 @@ def insert(
     seed: Seed = 0,
     film: Path | None = None,
     picture: Path | None = None,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Insert the needle of a plan with errors, blindly and planned again by what a tracker sees.
 
@@ -214,7 +214,7 @@ def insert(
         require_writable_folder(film.parent)
     if picture is not None:
         require_picture(picture)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     model = None if errors is None else lazy.load_errors(errors)
     with progress("inserting needles"):
         found = lazy.insert_plan(
@@ -227,7 +227,7 @@ def insert(
     if picture is not None:
         files.append(str(lazy.insertions_png(found, lung, picture)))
     record = found.to_mapping()
-    output.tell({**record, "plan_accepted": accepted, "files": files})
+    terminal.tell({**record, "plan_accepted": accepted, "files": files})
     if not accepted:
         terminal.say("The check REFUSES this plan: `lungaccess check` says why.")
     terminal.show([_table(found, record)])

@@ -14,13 +14,13 @@ from lungaccess.cli import lazy, terminal
 from lungaccess.cli.commands.exchange import template_text
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Angle, NotNegative, Processes
-from lungaccess.cli.options import DEFAULT_SYSTEM, CacheOptions, OutputOptions, require_picture
+from lungaccess.cli.options import DEFAULT_SYSTEM, require_picture
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import claim_folder, keep_earlier
 from lungaccess.plans.record import picked
 
 
-def presets(*, show: str | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
+def presets(*, show: str | None = None) -> ExitCode:
     """List the systems that ship with lungaccess, the least invasive first, or print one to start from.
 
     Its JSON holds every setting.
@@ -28,13 +28,13 @@ def presets(*, show: str | None = None, output: OutputOptions = OutputOptions())
     Args:
         show: Print the TOML file of this system: edit it, and hand it over with --system FILE.
     """
-    if show is not None and not output.json:
+    if show is not None and not terminal.console.as_json:
         terminal.console.file.write(lazy.preset_text(show))
         return ExitCode.OK
     ordered = [system.name for system in lazy.presets_by_invasiveness()]
     names = (*ordered, *lazy.tube_preset_names(), *lazy.needle_preset_names()) if show is None else (show,)
     systems = {name: lazy.load_system(name) for name in names}
-    output.tell({name: lazy.to_mapping(system) for name, system in systems.items()})
+    terminal.tell({name: lazy.to_mapping(system) for name, system in systems.items()})
     rows = [
         (
             name,
@@ -62,7 +62,6 @@ def tubes(
     relative: Angle = 0.0,
     propose: bool = False,
     out: Path = Path("tubes.png"),
-    output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Deploy the tubes alone: tip, stability, sideways motion, picture.
 
@@ -87,8 +86,8 @@ def tubes(
         relative_rad=math.radians(relative),
     )
     _draw(answer, out)
-    if output.json:
-        _show_json(answer, propose)
+    if terminal.console.as_json:
+        terminal.tell(_record(answer, propose))
         return ExitCode.of(answer.acceptable)
     _show_tables(answer, propose)
     terminal.say(f"Written to {out}")
@@ -191,7 +190,7 @@ def _design_table(present: lazy.DesignProposal, choices: tuple[lazy.DesignPropos
     return terminal.table(title, headings, rows)
 
 
-def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
+def _record(answer: lazy.TubeAnswer, propose: bool) -> dict[str, Any]:
     written = lazy.tubes_record(answer)
     if propose:
         comparison = lazy.compare_sequences(answer)
@@ -207,7 +206,7 @@ def _show_json(answer: lazy.TubeAnswer, propose: bool) -> None:
                 | {name: lazy.to_mapping(getattr(each.tubes, name)) for name in ("outer", "inner")}
                 for each in lazy.design_choices(answer)[1]
             ]
-    terminal.show_json(written)
+    return written
 
 
 def _draw(answer: lazy.TubeAnswer, out: Path) -> None:
@@ -236,9 +235,7 @@ def _draw(answer: lazy.TubeAnswer, out: Path) -> None:
     )
 
 
-def shapes(
-    *, system: str = DEFAULT_SYSTEM, out: Path | None = None, output: CacheOptions = CacheOptions()
-) -> ExitCode:
+def shapes(*, system: str = DEFAULT_SYSTEM, out: Path | None = None) -> ExitCode:
     """Follow a design of one to three tubes through all insertions and relative rotations.
 
     Exit code 0 if the device allows any deployment; 1 if it allows none.
@@ -249,10 +246,10 @@ def shapes(
         out: CSV file for a table of all shapes.
     """
     device = lazy.load_tubes(system)
-    found = lazy.design_shapes(device, cache=output.cache)
+    found = lazy.design_shapes(device)
     if out is not None:
         lazy.save_shapes(found, out)
-    output.tell(lazy.shapes_record(device.name, found))
+    terminal.tell(lazy.shapes_record(device.name, found))
     terminal.show(
         [terminal.table(f"Shapes of {device.name}", ("", "", "limit"), _shapes_rows(device.name, found))]
     )
@@ -295,7 +292,6 @@ def design(
     out: Path = Path("lungaccess-design"),
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Search the numbers of a device that reach most targets of a cohort, or most often succeed there.
 
@@ -312,13 +308,11 @@ def design(
     asked = lazy.read_design(design) if design else lazy.design_of(tomllib.loads(template_text("design")))
     claim_folder(out, ())
     with progress(asked.study.name) as shown:
-        found = lazy.run_design(
-            asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
-        )
+        found = lazy.run_design(asked, out, scheduler=scheduler, workers=workers, progress=shown.step)
     best = found.front[0]
     values = {each.system.name: each.values for each in found.counted}
     lazy.front_png(found.criteria, values, [each.system.name for each in found.front], out / "front.png")
-    output.tell(found.record())
+    terminal.tell(found.record())
     _show(asked.study.name, found)
     terminal.console.print(lazy.settings_toml(best.system), soft_wrap=True)
     terminal.say(f"Written to {out}: device.toml, the device above; front/, design.json, front.png")

@@ -33,7 +33,7 @@ def export(
     ct: Path | None = None,
     anonymise: bool = False,
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Write a stored plan for other programs and systems; exit code 1 if the check refuses it.
 
@@ -58,7 +58,7 @@ def export(
     for folder in (slicer, trajectory, models, dicom):
         if folder is not None:
             claim_folder(folder, ("*",), force=force)
-    stored, lung = output.load_plan(plan, patient)
+    stored, lung = masks.load_plan(plan, patient)
     written: dict[Path, tuple[str, ...]] = {}
     with progress("checking the plan") as shown:
         appraisal = lazy.appraise(stored, lung)
@@ -76,7 +76,7 @@ def export(
             )
     folders = [{"folder": str(folder), "files": list(files)} for folder, files in written.items()]
     answer = {**(folders[0] if folders else {}), "accepted": appraisal.accepted}
-    output.tell(answer | ({"others": folders[1:]} if folders[1:] else {}))
+    terminal.tell(answer | ({"others": folders[1:]} if folders[1:] else {}))
     for folder, files in written.items():
         terminal.say(f"Written to {folder}: {', '.join(files)}")
     show_headline(appraisal.headline)
@@ -94,7 +94,7 @@ def stream(
     loop: Annotated[bool, Parameter(negative="")] = False,
     seconds: Seconds | None = None,
     errors: ErrorOptions = ErrorOptions(),
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Send poses, paths and phases of a plan by OpenIGTLink, and plan again from tracked poses.
 
@@ -111,25 +111,24 @@ def stream(
     """
     stored = lazy.Plan.load(plan)
     with lazy.Link(host, port, connects=connect) as link:
-        lung = output.load(patient)
+        lung = masks.load(patient)
         stored.require_lung(lung)
         report = lazy.check(stored, lung)
         if not report.accepted:
-            output.tell({"accepted": False, **report.to_mapping()})
+            terminal.tell({"accepted": False, **report.to_mapping()})
             show_headline(lazy.Headline.of(report, None))
             return ExitCode.NEGATIVE
         followed = errors.given_procedure()
         session = lazy.LiveSession(
-            stored, lung, link, rate_hz=rate, loop=loop, on_answer=None if output.json else _say,
+            stored, lung, link, rate_hz=rate, loop=loop, on_answer=_say,
             policy=None if followed is None else lazy.Policy(stored, lung, errors.load(), followed),
         )  # fmt: skip
-        if not output.json:
-            done = "Connecting to" if connect else "Listening at"
-            terminal.say(f"{done} {host}:{link.port}. Ctrl-C ends.")
+        done = "Connecting to" if connect else "Listening at"
+        terminal.say(f"{done} {host}:{link.port}. Ctrl-C ends.")
         with contextlib.suppress(KeyboardInterrupt):
             session.run(seconds)
         counts = session.counts
-    output.tell(asdict(counts))
+    terminal.tell(asdict(counts))
     link_counts = counts.link
     rows = [
         ("rounds", f"{counts.ticks}, of which {counts.overrun} took too long"),

@@ -20,19 +20,14 @@ from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import NotNegative
-from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
 from lungaccess.plans.record import picked
 
 
-def doctor(*, cache: Path | None = None, output: OutputOptions = OutputOptions()) -> ExitCode:
-    """Show versions, machine, compiled kernels and folders; exit code 1 if something has to be mended.
-
-    Args:
-        cache: Folder of prepared anatomies; the usual one if not given.
-    """
-    health = examine(cache)
-    output.tell(health)
+def doctor() -> ExitCode:
+    """Show versions, machine, compiled kernels and folders; exit code 1 if something has to be mended."""
+    health = examine()
+    terminal.tell(health)
     _show_doctor(health)
     return ExitCode.of(not health["complaints"])
 
@@ -82,7 +77,7 @@ def _mib(size: int) -> str:
     return f"{size / 2**20:.0f} MiB"
 
 
-def examine(cache: Path | None = None) -> dict[str, Any]:
+def examine() -> dict[str, Any]:
     """Return what there is of the installation, as plain values; sizes of memory are None where not known.
 
     No library is imported for it, so that it works where one is missing.
@@ -98,7 +93,7 @@ def examine(cache: Path | None = None) -> dict[str, Any]:
         "free_memory_bytes": _free_memory(),
         "libraries": _libraries(),
         "kernels": kernels,
-        "cache": look_at(cache or default_cache()),
+        "cache": look_at(default_cache()),
         "data": None if data is None else look_at(Path(data)),
     }
     warm = "warm" if kernels["warm"] == kernels["modules"] else "partly warm"
@@ -197,9 +192,7 @@ def look_at(path: Path) -> dict[str, Any]:
     }
 
 
-def selftest(
-    *, kind: Annotated[tuple[str, ...], Parameter(negative="")] = (), output: OutputOptions = OutputOptions()
-) -> ExitCode:
+def selftest(*, kind: Annotated[tuple[str, ...], Parameter(negative="")] = ()) -> ExitCode:
     """Compute proofs of every kind on drawn cases: compiled, in plain Python, and against a truth.
 
     Exit code 0 if all agree; 1 if a proof disagrees: kind, seed of the case and both numbers are said.
@@ -209,7 +202,7 @@ def selftest(
     """
     with progress("proofs") as shown:
         outcomes = lazy.self_test(kind, progress=shown.step)
-    output.tell([{**asdict(each), "held": each.held} for each in outcomes])
+    terminal.tell([{**asdict(each), "held": each.held} for each in outcomes])
     _show_selftest(outcomes)
     return ExitCode.of(all(each.held for each in outcomes))
 
@@ -244,13 +237,13 @@ cache = App(
 
 
 @cache.default
-def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
+def show() -> ExitCode:
     """List what is kept: anatomies, atlases, resting scopes, shapes of tubes, the longest unused first."""
-    folder = output.cache or default_cache()
+    folder = default_cache()
     entries, limit = _entries(folder), cache_limit_bytes()
     size = sum(entry.size_bytes for entry in entries)
     records = [_record(entry) for entry in entries]
-    output.tell({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": records})
+    terminal.tell({"folder": str(folder), "size_bytes": size, "limit_bytes": limit, "entries": records})
     if entries:
         headings = ("kind", "patient", "size", "pictures", "last used", "name")
         terminal.show([terminal.table(f"Kept in {folder}", headings, [_row(entry) for entry in entries])])
@@ -262,12 +255,7 @@ def show(*, output: CacheOptions = CacheOptions()) -> ExitCode:
 
 
 @cache.command(help_epilogue=epilogue("cache prune"))
-def prune(
-    *,
-    older_than: NotNegative | None = None,
-    max_size: str | None = None,
-    output: CacheOptions = CacheOptions(),
-) -> ExitCode:
+def prune(*, older_than: NotNegative | None = None, max_size: str | None = None) -> ExitCode:
     """Remove old formats, leftovers of killed commands, and what is too old or too much.
 
     Args:
@@ -275,15 +263,15 @@ def prune(
         max_size: What may stay, such as 2GB; LUNGACCESS_CACHE_LIMIT if not given.
     """
     most = cache_limit_bytes() if max_size is None else parse_size(max_size, "--max-size")
-    found = _entries(output.cache or default_cache())
-    return _remove(lazy.overdue(found, most_bytes=most, older_than_days=older_than), output)
+    found = _entries(default_cache())
+    return _remove(lazy.overdue(found, most_bytes=most, older_than_days=older_than))
 
 
 @cache.command(help_epilogue=epilogue("cache clear"))
-def clear(*, output: CacheOptions = CacheOptions()) -> ExitCode:
+def clear() -> ExitCode:
     """Remove all that is kept; what another command is writing just then stays."""
-    entries = _entries(output.cache or default_cache())
-    return _remove([each for each in entries if each.kind != "unfinished" or each.abandoned], output)
+    entries = _entries(default_cache())
+    return _remove([each for each in entries if each.kind != "unfinished" or each.abandoned])
 
 
 def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
@@ -298,12 +286,12 @@ def _entries(folder: Path) -> tuple[lazy.CacheEntry, ...]:
     )
 
 
-def _remove(entries: Iterable[lazy.CacheEntry], output: CacheOptions) -> ExitCode:
+def _remove(entries: Iterable[lazy.CacheEntry]) -> ExitCode:
     gone = list(entries)
     for entry in gone:
         lazy.remove_entry(entry)
     size = sum(entry.size_bytes for entry in gone)
-    output.tell({"removed": [_record(entry) for entry in gone], "size_bytes": size})
+    terminal.tell({"removed": [_record(entry) for entry in gone], "size_bytes": size})
     for each in gone:
         terminal.say(f"  {each.kind} {each.patient or each.path.name}, {size_in_words(each.size_bytes)}")
     terminal.say(f"Removed {len(gone)} of what was kept, {size_in_words(size)}.")

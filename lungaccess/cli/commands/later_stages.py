@@ -13,9 +13,8 @@ from anatomy.base.words import of_hundred
 from lungaccess.cli import lazy, options, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Count, Positive, Seed
-from lungaccess.cli.plan_search import arcs_table, no_plan_record
+from lungaccess.cli.plan_search import arcs_table
 from lungaccess.cli.progress import progress
-from lungaccess.plans.no_plan import NoPlan
 from stages.needle import DEFAULT, Objective
 
 
@@ -35,7 +34,7 @@ def replan(
     system: options.SystemOptions = options.SystemOptions(),
     objective: options.ObjectiveText = DEFAULT,
     seed: Seed = 0,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the rest from a measured pose: tubes and needle from the scope's tip, or the needle alone.
 
@@ -58,7 +57,7 @@ def replan(
     """
     if plan is not None or errors.procedure is not None:
         poses = {"scope": scope, "tubes": tube, "needle": needle}
-        return _decided(patient, poses, frame, plan, errors, placement, radius, record, output)
+        return _decided(patient, poses, frame, plan, errors, placement, radius, record, masks)
     Objective.of(objective)
     stated, device = target.stated(), system.load()
     given = scope if tube is None else tube
@@ -69,20 +68,14 @@ def replan(
             remedy="`lungaccess template pose` prints a file to start from",
         )
     pose, of_plan = _pose(given, "scope" if tube is None else "tubes", frame)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     if of_plan is not None:
         of_plan.require_lung(lung)
     options.require_map(lung, objective)
     aim, ask = stated.resolve(lung), lazy.replan_from_tube if scope is None else lazy.replan_from_scope
-    try:
-        with progress("planning the rest"):
-            found = ask(lung, device, pose, aim, objective=objective, seed=seed)
-    except NoPlan as failure:
-        if not output.json:
-            raise
-        terminal.show_json(no_plan_record(failure))
-        return ExitCode.NEGATIVE
-    output.tell(found.record())
+    with progress("planning the rest"):
+        found = ask(lung, device, pose, aim, objective=objective, seed=seed)
+    terminal.tell(found.record())
     terminal.show(_replan_tables(found, has_map=lung.cost is not None))
     return ExitCode.OK
 
@@ -96,7 +89,7 @@ def _decided(
     placement: int,
     radius: float | None,
     kept: Path | None,
-    output: options.PatientOptions,
+    masks: options.PatientOptions,
 ) -> ExitCode:
     procedure = errors.given_procedure()
     if carried_out is None or procedure is None:
@@ -106,7 +99,7 @@ def _decided(
             remedy="For instance --plan plan.json --procedure measured-tip",
         )
     poses = {name: [_pose(text, name, frame)[0]] for name, text in stated.items() if text is not None}
-    plan, lung = lazy.Plan.load(carried_out), output.load(patient)
+    plan, lung = lazy.Plan.load(carried_out), masks.load(patient)
     if kept is not None and kept.exists():
         record = lazy.ProcedureRecord.load(kept, plan, lung)
     else:
@@ -115,7 +108,7 @@ def _decided(
         decision = record.decide(lazy.Measurements.of(**poses, placements=placement))  # type: ignore[arg-type]
     if kept is not None:
         record.save(kept)
-    output.tell(decision.record())
+    terminal.tell(decision.record())
     terminal.show(decision_tables(decision))
     return ExitCode.of(decision.goes_on)
 
@@ -195,7 +188,7 @@ def needle(
     objective: options.ObjectiveText = "length",
     budget: options.BudgetOptions = options.BudgetOptions(),
     out: Path | None = None,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the needle alone from a given pose, or prove that no path exists and say what is blocked.
 
@@ -211,7 +204,7 @@ def needle(
     if out is not None:
         options.require_picture(out)
     stated, weighed = target.stated(), Objective.of(objective)
-    device, lung, limit_s = system.load(), output.load_organ(patient), budget.time_s
+    device, lung, limit_s = system.load(), masks.load_organ(patient), budget.time_s
     pose, aim = _start_pose(lung, start, frame), stated.resolve(lung)
     with progress("searching" if limit_s is None else f"searching, at most {limit_s:g} s"):
         answer = lazy.plan_needle(
@@ -230,7 +223,7 @@ def needle(
         checked = lazy.check_needle_alone(
             lung, device, pose, answer.path.arcs, aim.lps_mm, branches=answer.branches, at_wall=answer.at_wall
         )
-    output.tell(answer.record() | {"check": checked and checked.to_mapping()})
+    terminal.tell(answer.record() | {"check": checked and checked.to_mapping()})
     terminal.show(_needle_tables(answer, is_lung=isinstance(lung, lazy.Lung)))
     if checked is not None:
         verdict = "accepts" if checked.accepted else "REFUSES"

@@ -16,7 +16,7 @@ from anatomy.segmentation.vessels import LARGE_RADIUS_MM
 from lungaccess.cli import anatomy_tables, lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Positive, Seed
-from lungaccess.cli.options import OutputOptions, PatientFolder, PatientOptions
+from lungaccess.cli.options import PatientFolder, PatientOptions
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder, require_empty_folder
 
@@ -47,7 +47,6 @@ def segment(
     name: str = "",
     pictures: bool = True,
     force: bool = False,
-    output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Segment a chest CT into lungs, airway, vessels and cost map: a folder that the other commands take.
 
@@ -88,7 +87,6 @@ def segment(
         pictures: Draw the pictures of the quality report.
         force: Take masks and a patient.toml of others that lie in the folder for corrections, instead of
             refusing.
-        json: Print JSON, the content of quality.json, instead of tables.
     """
     for point in (target, seed, *nodule):
         if point is not None:
@@ -139,7 +137,7 @@ def segment(
                 found = out / lazy.REFUSED_PICTURE
                 terminal.progress_console.print(f"{found} shows what was found", highlight=False)
             raise
-    output.tell(made.record)
+    terminal.tell(made.record)
     terminal.show(_tables(made.result, made.quality))
     terminal.show_warnings(made.warnings)
     kept = " patient.toml was edited by hand and is kept as it was." if made.result.kept_description else ""
@@ -184,7 +182,7 @@ def info(
     out: Path | None = None,
     details: Annotated[bool, Parameter(negative="")] = False,
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Show what was understood of a patient: volumes, airway tree, sources and warnings.
 
@@ -194,8 +192,8 @@ def info(
     """
     if out is not None:
         claim_folder(out, ("tree.png", "motion.png", "organ.png"), force=force)
-    lung = output.load_organ(patient, thick_slices=True, refuse=False)
-    output.tell(anatomy_tables.organ_record(lung))
+    lung = masks.load_organ(patient, thick_slices=True, refuse=False)
+    terminal.tell(anatomy_tables.organ_record(lung))
     terminal.show(anatomy_tables.anatomy_tables(lung, details=details))
     terminal.show_warnings(lung.warnings)
     if out is not None:
@@ -217,7 +215,6 @@ def phantom(
     spacing: Positive | None = None,
     breathing: Annotated[bool, Parameter(negative="")] = False,
     force: Force = False,
-    output: OutputOptions = OutputOptions(),
 ) -> ExitCode:
     """Write a synthetic patient: masks, CT and the truth about it; no data are needed.
 
@@ -237,7 +234,7 @@ def phantom(
         {"lps_mm": nodule.centre_lps.tolist(), "radius_mm": float(nodule.radius_mm)}
         for nodule in made.nodules
     ]
-    output.tell({"folder": str(out), "name": made.images.name, "nodules": nodules})
+    terminal.tell({"folder": str(out), "name": made.images.name, "nodules": nodules})
     rows = [
         ("lps:" + ",".join(f"{value:.1f}" for value in nodule.centre_lps), f"{2.0 * nodule.radius_mm:.1f}")
         for nodule in made.nodules

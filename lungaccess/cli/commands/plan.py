@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.panel import Panel
 
@@ -29,7 +28,6 @@ def demo(
     # The first nodule of this synthetic patient can be reached, and its plan becomes better in many steps.
     seed: Seed = 1,
     force: Force = False,
-    output: options.CacheOptions = options.CacheOptions(),
 ) -> ExitCode:
     """Make a synthetic patient, plan to one of its nodules, check and draw the plan, write a page on it.
 
@@ -43,12 +41,11 @@ def demo(
     search = options.SearchOptions(budget=budget, seed=seed)
     claim_folder(out, plan_search.RESULTS, force=force)
     with progress("making a synthetic patient") as shown:
-        lung = demo_lung(seed, output.cache, shown.step)
+        lung = demo_lung(seed, shown.step)
     target, systems = lazy.stated_target(None, 1), options.SystemOptions().candidates()
-    if not output.json:
-        terminal.show(anatomy_tables(lung)[1:3])
+    terminal.show(anatomy_tables(lung)[1:3])
     guide = what_to_look_at(out)
-    job = plan_search.PlanJob(asked=search.asked(systems), target=target, out=out, output=output, guide=guide)
+    job = plan_search.PlanJob(asked=search.asked(systems), target=target, out=out, guide=guide)
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
         try:
@@ -63,14 +60,14 @@ def demo(
     )
 
 
-def demo_lung(seed: int, cache: Path | None, progress: Callable[[str], None]) -> lazy.Lung:
+def demo_lung(seed: int, progress: Callable[[str], None]) -> lazy.Lung:
     """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
     """
     # Coarse enough that the patient is made within seconds, fine enough for the airways of the plan.
     images = lazy.make_phantom(seed=seed, size="adult", spacing_mm=1.25).images
-    return lazy.open_lung(dict(images.sources), lambda: images, cache=cache, progress=progress)
+    return lazy.open_lung(dict(images.sources), lambda: images, progress=progress)
 
 
 def what_to_look_at(out: Path) -> Panel:
@@ -103,7 +100,7 @@ def plan(
     pictures: bool = True,
     explain_time: NotNegative | None = None,
     force: Force = False,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Plan the access to a target, check the plan, and write plan, pictures and cost over time.
 
@@ -119,54 +116,47 @@ def plan(
     systems = lazy.systems_with_tool(system.candidates(), tool)
     asked = search.asked(systems, errors.given(), errors.given_procedure(), through.stated())
     claim_folder(out, plan_search.RESULTS, force=force)
-    lung = output.load(patient, thick_slices=thick_slices)
-    job = plan_search.PlanJob(asked=asked, target=stated, out=out, output=output, pictures=pictures)
+    lung = masks.load(patient, thick_slices=thick_slices)
+    job = plan_search.PlanJob(asked=asked, target=stated, out=out, pictures=pictures)
     try:
         return plan_search.plan_and_report(lung, job)
     except NoPlan as failure:
         # What would help is explained for the target of the masks, where nothing moves.
-        if explain_time != 0.0 and not asked.request(lung, stated.resolve(lung)).is_for_window:
-            record = explain_and_report(lung, job, failure, search.cost, explain_time)
-        elif output.json:
-            record = plan_search.no_plan_record(failure)
-        else:
+        if explain_time == 0.0 or asked.request(lung, stated.resolve(lung)).is_for_window:
             raise
-        if output.json:
-            terminal.show_json(record)
+        explain_and_report(lung, job, failure, search.cost, explain_time)
         return ExitCode.NEGATIVE
 
 
 def explain_and_report(
     lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
-) -> dict[str, Any]:
-    """Explain a `NoPlan`, write and show what was learned, and return it as plain values.
+) -> None:
+    """Explain a `NoPlan`, write and show what was learned.
 
     Plans of other systems are searched by `cost`; the time is that of `explain_no_plan` if None.
     """
     explanation = _explained(lung, job, failure, cost, time_s)
     written = lazy.save_explanation(explanation, job.out)
-    if not job.output.json:
-        show_explanation(explanation)
+    show_explanation(explanation)
     if job.pictures:
         written = (*written, *_drawn(lung, job, explanation))
     record = lazy.explanation_record(explanation)
     record |= {"folder": str(job.out), "files": list(written)}
-    if not job.output.json:
-        terminal.say(f"Written to {job.out}: {', '.join(written)}")
-    return record
+    terminal.tell(record)
+    terminal.say(f"Written to {job.out}: {', '.join(written)}")
 
 
 def _explained(
     lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> lazy.Explanation:
-    system, cache = job.asked.systems[0], job.output.cache
+    system = job.asked.systems[0]
 
     def atlas_of(other: lazy.System, on_share: Callable[[float], None]) -> lazy.Atlas:
         def tell(share: float) -> None:
             on_share(share)
             shown.step(f"atlas of {other.name}", share)
 
-        return lazy.open_atlas(lung, other, cache=cache, progress=tell)
+        return lazy.open_atlas(lung, other, progress=tell)
 
     with progress("no plan: looking for what would help") as shown:
         return lazy.explain_no_plan(
@@ -174,12 +164,12 @@ def _explained(
             system,
             job.target.resolve(lung),
             failure,
-            atlas=lazy.open_atlas(lung, system, cache=cache, progress=shown.share),
+            atlas=lazy.open_atlas(lung, system, progress=shown.share),
             objective=cost,
             seed=job.asked.fields["seed"],
             time_s=lazy.DEFAULT_TIME_S if time_s is None else time_s,
             atlas_of=atlas_of,
-            is_kept=lambda other: lazy.atlas_is_kept(lung, other, cache=cache),
+            is_kept=lambda other: lazy.atlas_is_kept(lung, other),
             on_part=shown.step,
         )
 
@@ -232,7 +222,7 @@ def alternatives(
     errors: options.ErrorOptions = options.ErrorOptions(),
     out: Path = Path("lungaccess-alternatives"),
     force: Force = False,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Show plans to one target that differ, check each, and write them.
 
@@ -246,12 +236,12 @@ def alternatives(
     stated, systems = target.stated(), system.candidates()
     asked = search.asked(systems, errors.given(), errors.given_procedure())
     claim_folder(out, ("plan-*.json", TRADE_OFF), force=force)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     request = asked.request(lung, stated.resolve(lung))
     with progress("searching") as shown:
 
         def atlas_of(device: lazy.System) -> lazy.Atlas:
-            return lazy.open_atlas(lung, device, cache=output.cache, progress=shown.share)
+            return lazy.open_atlas(lung, device, progress=shown.share)
 
         found = lazy.answer_with_several(request, count=count, separation_mm=separation, atlas_of=atlas_of)
     chosen, by_success = plan_search.system_of(found[0].plan, systems), request.goal is SUCCESS
@@ -267,7 +257,7 @@ def alternatives(
     if drawing := lazy.trade_off_svg(found):
         write_text(out / TRADE_OFF, drawing)
     refused = sum(not each.accepted for each in appraisals)
-    output.tell(_records(found, appraisals, out, lung.cost is not None))
+    terminal.tell(_records(found, appraisals, out, lung.cost is not None))
     _show(lung, found, appraisals)
     if found[0].plan.system_choice:
         terminal.say(" ".join(found[0].plan.system_choice))

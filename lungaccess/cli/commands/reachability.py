@@ -30,7 +30,7 @@ def reach(
     out: Path = Path("lungaccess-reach"),
     page: Path | None = None,
     force: Force = False,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Map what a system reaches of the lung, and write the map as volumes for 3D Slicer and as a picture.
 
@@ -54,7 +54,7 @@ def reach(
     folder = claim_folder(out, ("reach.json", "reach.png", "reach*.nrrd", "reach-*.png"), force=force)
     if page is not None:
         require_writable_folder(page.parent)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     with progress("scanning") as shown:
         maps = lazy.compare_reach(
             lung, systems, spacing_mm=spacing, trees=search, phases=asked, work=folder, progress=shown.step
@@ -67,7 +67,7 @@ def reach(
     write_json(folder / "reach.json", written)
     if page is not None:
         lazy.reach_page(maps, lung, page)
-    output.tell(written)
+    terminal.tell(written)
     terminal.show([_region_table(each) for each in maps])
     if len(maps) > 1:
         terminal.show([_comparison_table(maps)])
@@ -165,7 +165,7 @@ def certify(
     most_boxes: Count | None = None,
     time_s: Annotated[Seconds | None, Parameter(name="--time")] = None,
     out: Path | None = None,
-    output: options.PatientOptions = options.PatientOptions(),
+    masks: options.PatientOptions = options.PatientOptions(),
 ) -> ExitCode:
     """Prove that a target is unreachable: from no place in the airways, however scope and tubes are turned.
 
@@ -181,7 +181,7 @@ def certify(
         options.require_picture(out)
     stated = target.stated()
     device = system.load()
-    lung = output.load(patient)
+    lung = masks.load(patient)
     point = stated.centre_lps(lung)
     with progress("proving") as shown:
         proof = lazy.UnreachableProof(lung, device, with_fissures=not device.fissures_allowed)
@@ -194,7 +194,7 @@ def certify(
     if out is not None:
         lazy.open_places_png(lung, proof, verdict, point, out)
     asked = {"patient": lung.name, "system": device.name, "target_lps_mm": point.tolist()}
-    output.tell(
+    terminal.tell(
         {
             **asked,
             **lazy.made_by(),

@@ -31,7 +31,7 @@ def risk(
     tool: ToolText = None,
     seed: Seed = 0,
     processes: Processes = 1,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Estimate how likely a stored plan succeeds if the devices deviate from it.
 
@@ -46,7 +46,7 @@ def risk(
 
     model, followed = errors.load(), errors.given_procedure() or lazy.Procedure()
     tool_given = None if tool is None else lazy.load_tool(tool)
-    stored, lung = output.load_plan(plan, patient)
+    stored, lung = masks.load_plan(plan, patient)
     stored = replace(stored, system=lazy.with_tool(stored.system, tool_given))
     with progress("bringing the scope to rest on the wall"):
         wall = model.wall or lazy.WallContact()
@@ -63,7 +63,7 @@ def risk(
                 radius_mm=radius,
                 processes=processes,
             )
-        output.tell(procedure_record(found) | resting_record(rested))
+        terminal.tell(procedure_record(found) | resting_record(rested))
         terminal.say(lazy.Headline.of(None, found).chance_text)
         terminal.show([*procedure_tables(found), _resting_table(rested)])
         return ExitCode.OK
@@ -74,7 +74,7 @@ def risk(
         kept = lazy.find_tolerances(
             stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
         )
-    output.tell(record(report, kept) | resting_record(rested))
+    terminal.tell(record(report, kept) | resting_record(rested))
     terminal.say(lazy.Headline.of(None, report).chance_text)
     planned = stored.chance
     if planned is not None and planned.procedure != followed.name:
@@ -258,7 +258,7 @@ def start_region(
     radius: NotNegative | None = None,
     scope: bool = False,
     seed: Seed = 0,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Tell from which poses near its start the needle of a stored plan still reaches the target, clear.
 
@@ -272,7 +272,7 @@ def start_region(
         scope: Whether poses of the scope's tip are tried as well, which takes some seconds.
         seed: Seed of the search.
     """
-    stored, lung = output.load_plan(plan, patient)
+    stored, lung = masks.load_plan(plan, patient)
     with progress("trying start poses"):
         region = lazy.safe_start_region(
             stored, lung, radius_mm=radius, offset_mm=distance, tilt_deg=tilt, poses=poses,
@@ -283,7 +283,7 @@ def start_region(
         with progress("trying poses of the scope"):
             of_scope = lazy.safe_scope_region(stored, lung, seed=seed)
     told = {} if of_scope is None else {"scope": of_scope.record()}
-    output.tell({**region.record(), **told})
+    terminal.tell({**region.record(), **told})
     terminal.say(f"{region.words}.")
     if of_scope is not None:
         terminal.say(f"{of_scope.words}.")

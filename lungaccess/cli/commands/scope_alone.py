@@ -10,7 +10,7 @@ from anatomy.io.frames import Frame, parse_point
 from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, NotNegative, Positive, Seed
-from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions
+from lungaccess.cli.options import DEFAULT_SYSTEM, PatientFolder, PatientOptions, TargetOptions, open_atlas
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import Force, claim_folder
 
@@ -24,7 +24,7 @@ def advise(
     seed: Seed = 0,
     out: Path = Path("lungaccess-advice"),
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Advise the bronchoscope: turn by turn to a lesion, or as near as it gets, and why not nearer.
 
@@ -40,11 +40,11 @@ def advise(
     stated = target.stated()
     claim_folder(out, (lazy.ADVICE_FILE, lazy.CAMERA_FILE), force=force)
     device = lazy.load_system(system)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     with progress("steering the scope"):
         advice = lazy.advise_scope(lung, device, stated.centre_lps(lung), lesion_radius, seed=seed)
     lazy.save_advice(advice, out)
-    output.tell(advice.as_json())
+    terminal.tell(advice.as_json())
     _show_advise(advice)
     terminal.say(f"Written to {out}: {lazy.ADVICE_FILE}, {lazy.CAMERA_FILE}")
     return ExitCode.of(advice.path.reached)
@@ -92,7 +92,7 @@ def tour(
     per_lesion: NotNegative = 300.0,
     out: Path = Path("lungaccess-tour"),
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan the shortest tour of the scope to several lesions, and draw it; exit code 1 if one is left out.
 
@@ -115,9 +115,9 @@ def tour(
     stated = None if targets is None else lazy.read_lesions(targets)
     claim_folder(out, ("tour.json", "tour.png"), force=force)
     device = lazy.load_system(system)
-    lung = output.load(patient)
+    lung = masks.load(patient)
     lesions = lazy.lesions_of(lung) if stated is None else stated
-    atlas = output.open_atlas(lung, device) if require_plan else None
+    atlas = open_atlas(lung, device) if require_plan else None
     with progress("planning the tour"):
         answer = lazy.plan_tour(
             lung,
@@ -131,7 +131,7 @@ def tour(
         )
     write_json(out / "tour.json", lazy.tour_record(answer))
     lazy.tour_png(answer, lung, out / "tour.png")
-    output.tell(lazy.tour_record(answer))
+    terminal.tell(lazy.tour_record(answer))
     _show_tour(answer, speed, per_lesion)
     terminal.say(f"Written to {out}: tour.json, tour.png")
     for number, why in answer.left_out.items():
@@ -210,7 +210,7 @@ def route(
     pixel: Positive | None = None,
     out: Path = Path("lungaccess-route"),
     force: Force = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Plan a route of limited curvature along airways or vessels, prove it on the whole curve, draw it.
 
@@ -243,9 +243,7 @@ def route(
     claim_folder(out, ("route.json", "route.png"), force=force)
     with progress("route") as shown:
         shown.step("reading the tubes")
-        opened = lazy.open_source(
-            source, lumen=lumen, frame=frame, pixel_mm=pixel, cache=output.cache, accept=output.accept
-        )
+        opened = lazy.open_source(source, lumen=lumen, frame=frame, pixel_mm=pixel, accept=masks.accept)
         shown.step("planning")
         end = opened.place(goal, limits.needed_mm)
         first = lazy.widest_end(opened.centreline) if start is None else opened.place(start, limits.needed_mm)
@@ -255,8 +253,8 @@ def route(
     written = lazy.route_record(opened, found)
     write_json(out / "route.json", written)
     lazy.route_png(opened.name, opened.centreline, found, out / "route.png")
-    if output.json:
-        terminal.show_json(written)
+    terminal.tell(written)
+    if terminal.console.as_json:
         return ExitCode.of(found.proved)
     rows = [
         ("length", f"{written['length_mm']:.1f} mm", ""),

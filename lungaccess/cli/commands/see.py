@@ -7,12 +7,20 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from anatomy.base.cache import stated_cache
 from anatomy.base.errors import SettingsError
 from anatomy.base.files import require_writable_folder
 from lungaccess.cli import lazy, terminal
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import CountOrNone, Port, SamplesOrNone, Seed
-from lungaccess.cli.options import DEFAULT_SYSTEM, ErrorOptions, PatientOfPlan, PatientOptions, PlanFile
+from lungaccess.cli.options import (
+    DEFAULT_SYSTEM,
+    ErrorOptions,
+    PatientOfPlan,
+    PatientOptions,
+    PlanFile,
+    open_atlas,
+)
 from lungaccess.cli.plan_search import HISTORY_FILE, advised, steps_table
 from lungaccess.cli.progress import progress
 from lungaccess.cli.result_folder import held, keep_earlier
@@ -31,7 +39,7 @@ def report(
     samples: SamplesOrNone | None = None,
     seed: Seed | None = None,
     instructions: bool = True,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Write one HTML file about a stored plan: it plays in 3-D, with slices, charts, limits and risk.
 
@@ -52,14 +60,14 @@ def report(
         require_writable_folder(file.parent)
     keep_earlier(page)
     model, followed = errors.given(), errors.given_procedure()
-    stored, lung = output.load_plan(plan, patient)
+    stored, lung = masks.load_plan(plan, patient)
     image = shown_ct(ct, patient)
     with progress("making the page"):
         appraisal = lazy.appraise(
             stored, lung, errors=model, procedure=followed, draws=samples, seed=seed, each_kind=True
         )
         options = lazy.PageOptions(
-            alternatives=_others(stored, lung, alternatives, output) if alternatives else (),
+            alternatives=_others(stored, lung, alternatives) if alternatives else (),
             ct=None if image is None else image.read(),
             ct_name="" if image is None else image.path.name,
             cost_over_time=plan.parent / HISTORY_FILE,
@@ -69,24 +77,24 @@ def report(
             risk_seed=seed,
             instructions=instructions,
             appraisal=appraisal,
-            advice=advised(stored, lung, model, followed, output.cache, appraisal),
+            advice=advised(stored, lung, model, followed, appraisal),
         )
         lazy.plan_page(stored, lung, page, options)
         if movie is not None:
             lazy.bronchoscopy_webp(stored, lung, movie)
     files = [str(file) for file in (page, movie) if file is not None]
-    output.tell({"files": files, "page_bytes": page.stat().st_size})
+    terminal.tell({"files": files, "page_bytes": page.stat().st_size})
     terminal.say(f"Written: {', '.join(files)} (the page has {page.stat().st_size / 1e6:.1f} MB)")
     return ExitCode.OK
 
 
-def _others(plan: lazy.Plan, lung: lazy.Lung, count: int, output: PatientOptions) -> tuple[lazy.Plan, ...]:
+def _others(plan: lazy.Plan, lung: lazy.Lung, count: int) -> tuple[lazy.Plan, ...]:
     """Return plans to the target of a plan that differ from each other; none if no direct arc reaches it.
 
     Of a patient that breathes they have their windows.
     """
     target = lazy.Target(lps_mm=plan.target_lps, origin=plan.target_origin)
-    atlas = output.open_atlas(lung, plan.system)
+    atlas = open_atlas(lung, plan.system)
     try:
         found = lazy.alternatives(lung, plan.system, target, goal=plan.objective, count=count, atlas=atlas)
     except NoPlan:
@@ -104,7 +112,7 @@ def view(
     port: Port | None = None,
     browser: bool = True,
     thick_slices: bool = False,
-    output: PatientOptions = PatientOptions(),
+    masks: PatientOptions = PatientOptions(),
 ) -> ExitCode:
     """Explore a patient or a CT: click a target, see the feasible exits and better and better plans.
 
@@ -138,8 +146,11 @@ def view(
     first = lazy.load_system(system)
     if patient is not None and lazy.is_ct(patient):
         made = out or lazy.patient_folder(patient, series)
-        terminal.console.quiet |= output.json  # Only the address is printed then.
-        segment(patient, out=made, series=series, thick_slices=thick_slices, accept=output.accept)
+        as_json, terminal.console.as_json = terminal.console.as_json, False  # Only the address is told.
+        try:
+            segment(patient, out=made, series=series, thick_slices=thick_slices, accept=masks.accept)
+        finally:
+            terminal.console.as_json = as_json
         held.close()  # The explorer writes into the folder, too, when a nodule is added.
         patient = made
     elif out is not None or series is not None:
@@ -152,16 +163,15 @@ def view(
     if shown is not None:
         shown.read()  # Here, where a file that is none is refused before anything is shown.
     if patient is not None:
-        output.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
+        masks.load(patient, thick_slices=thick_slices)  # Prepared and kept here, with its progress shown.
         patient = patient.resolve()
     own = () if system in lazy.shipped_names() else ((Path(system).resolve(), first),)
     source = PatientSource(
-        folder=patient, system=first.name, own=own, cache=output.cache,
-        ct=shown, accept=output.accept,
-    )  # fmt: skip
+        folder=patient, system=first.name, own=own, cache=stated_cache(), ct=shown, accept=masks.accept
+    )
 
     def started(address: Address) -> None:
-        output.tell({"address": address.url, "port": address.port})
+        terminal.tell({"address": address.url, "port": address.port})
         terminal.say(f"The explorer is at {address.url}\nCtrl-C ends it.")
         if browser:
             webbrowser.open(address.url)
@@ -170,13 +180,12 @@ def view(
     return ExitCode.OK
 
 
-def steps(plan: PlanFile, patient: PatientOfPlan, *, output: PatientOptions = PatientOptions()) -> ExitCode:
+def steps(plan: PlanFile, patient: PatientOfPlan, *, masks: PatientOptions = PatientOptions()) -> ExitCode:
     """Print step by step how the bronchoscope of a plan moves; with --json also every state, for motors."""
-    stored, lung = output.load_plan(plan, patient)
-    if output.json:
-        terminal.show_json(lazy.motion_record(stored, lung))
-    else:
-        terminal.show([steps_table(stored, lung)])
+    stored, lung = masks.load_plan(plan, patient)
+    if terminal.console.as_json:
+        terminal.tell(lazy.motion_record(stored, lung))
+    terminal.show([steps_table(stored, lung)])
     return ExitCode.OK
 
 

@@ -13,7 +13,6 @@ from lungaccess.cli import lazy, terminal
 from lungaccess.cli.examples import epilogue
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.cli.numbers import Processes
-from lungaccess.cli.options import CacheOptions, OutputOptions
 from lungaccess.cli.progress import progress
 
 study = App(
@@ -30,7 +29,6 @@ def run(
     out: Path = Path("results.db"),
     scheduler: str | None = None,
     workers: Annotated[Processes | None, Parameter(name="--workers")] = None,
-    output: CacheOptions = CacheOptions(),
 ) -> ExitCode:
     """Make the runs of a study that the results do not have yet; exit code 1 if one could not be made.
 
@@ -44,11 +42,9 @@ def run(
     """
     asked = lazy.read_study(study)
     with progress(asked.name) as shown:
-        done = lazy.run_study(
-            asked, out, scheduler=scheduler, workers=workers, cache=output.cache, progress=shown.step
-        )
+        done = lazy.run_study(asked, out, scheduler=scheduler, workers=workers, progress=shown.step)
     groups = lazy.summarise(out)
-    output.tell(asdict(done) | {"results": str(out), "groups": [asdict(group) for group in groups]})
+    terminal.tell(asdict(done) | {"results": str(out), "groups": [asdict(group) for group in groups]})
     terminal.show([_table(asked.name, groups)])
     terminal.console.print(
         f"{done.runs} runs: {done.stored_before} were stored, {done.added} added in {done.wall_s:.1f} s. "
@@ -67,26 +63,20 @@ def run(
 
 
 @study.command(help_epilogue=epilogue("study show"))
-def show(results: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
+def show(results: Path) -> ExitCode:
     """Show what is stored, by case and planner.
 
     Args:
         results: Results file.
     """
     groups = lazy.summarise(results)
-    output.tell([asdict(group) for group in groups])
+    terminal.tell([asdict(group) for group in groups])
     terminal.show([_table(str(results), groups)])
     return ExitCode.OK
 
 
 @study.command(help_epilogue=epilogue("study export"))
-def export(
-    results: Path,
-    *,
-    csv: Path | None = None,
-    parquet: Path | None = None,
-    output: OutputOptions = OutputOptions(),
-) -> ExitCode:
+def export(results: Path, *, csv: Path | None = None, parquet: Path | None = None) -> ExitCode:
     """Write the tables of the results as CSV or Parquet.
 
     Args:
@@ -102,21 +92,21 @@ def export(
         )
     written = [] if csv is None else lazy.export_csv(results, csv)
     written += [] if parquet is None else lazy.export_parquet(results, parquet)
-    output.tell({"written": [str(path) for path in written]})
+    terminal.tell({"written": [str(path) for path in written]})
     for path in written:
         terminal.say(f"Written to {path}")
     return ExitCode.OK
 
 
 @study.command(help_epilogue=epilogue("study compare"))
-def compare(first: Path, second: Path, *, output: OutputOptions = OutputOptions()) -> ExitCode:
+def compare(first: Path, second: Path) -> ExitCode:
     """Compare two results files, but for times and memory; exit code 1 if they differ.
 
     Args:
         first, second: Results files.
     """
     found = lazy.differences(first, second)
-    output.tell(found)
+    terminal.tell(found)
     for each in found:
         terminal.say(each)
     terminal.console.print("They differ." if found else "They hold the same runs with the same answers.")

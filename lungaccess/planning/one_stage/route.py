@@ -1,6 +1,5 @@
 """Sources of centrelines for the route planner, and the record of a route."""
 
-import os
 from collections.abc import Collection, Mapping
 from dataclasses import field
 from pathlib import Path
@@ -51,7 +50,6 @@ def open_source(
     lumen: str | None = None,
     frame: Frame | None = None,
     pixel_mm: float | None = None,
-    cache: str | os.PathLike[str] | None = None,
     accept: Collection[str] = (),
 ) -> RouteSource:
     """Return the centreline of a patient folder, a centreline file, a mask of vessels or a drawing.
@@ -75,7 +73,7 @@ def open_source(
     if path.is_dir():
         from lungaccess.problem.patients import load_patient
 
-        lung = load_patient(path, cache=cache, accept=accept)
+        lung = load_patient(path, accept=accept)
         return RouteSource(
             name=lung.name,
             kind="patient",

@@ -229,10 +229,8 @@ def tubes_of(device: System | BareTubes) -> tuple[stage.Tube, ...]:
     return device.tubes
 
 
-def design_shapes(
-    device: System | BareTubes, *, cache: str | os.PathLike[str] | None = None
-) -> stage.TubeShapes:
-    """Return the shapes of a design, of bare tubes by default limits; cache and errors: `open_shapes`."""
+def design_shapes(device: System | BareTubes) -> stage.TubeShapes:
+    """Return the shapes of a design, of bare tubes by default limits; errors: `open_shapes`."""
     limits, needle = stage.ShapeLimits(), None
     if isinstance(device, System):
         stated = device.tubes
@@ -242,7 +240,7 @@ def design_shapes(
             max_lateral_sweep_mm=stated.max_lateral_sweep_mm,
             max_strain=stated.max_strain,
         )
-    return stage.open_shapes(tubes_of(device), limits, needle=needle, cache=cache)
+    return stage.open_shapes(tubes_of(device), limits, needle=needle)
 
 
 COSTS = ("lateral_sweep_mm", "follow_the_leader_error_mm", "strain", "arc_error_mm")

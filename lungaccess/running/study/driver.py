@@ -12,6 +12,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from anatomy.base.cache import stated_cache
 from anatomy.base.errors import LungaccessError, SettingsError
 from anatomy.base.records import frozen_value
 from anatomy.base.unfinished import sole_writer
@@ -84,6 +85,7 @@ def open_results(
             remedy="Leave out --workers",
         )
     require_dask()
+    cache = cache or stated_cache()  # Workers of another machine do not have the environment of this one.
     with ResultsFile(path, create=True) as results, contextlib.ExitStack() as stack:
         stack.enter_context(sole_writer(path, path.parent, f".{path.name}.lock"))
         yield RunMaker(results, cache, lambda: stack.enter_context(connect(scheduler, workers)))

@@ -16,7 +16,7 @@ from lungaccess.cli.options import STEP_SHARES
 def loud_again(wide_terminal: None) -> Any:
     """Let no test leave the consoles quiet or narrow."""
     yield
-    terminal.set_quiet(False)
+    terminal.set_answers()
 
 
 @pytest.fixture(scope="session")

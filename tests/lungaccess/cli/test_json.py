@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
+import re
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from anatomy.base.cache import default_cache
 from anatomy.machine_code.sources import kernel_digest
 from lungaccess.cli import anatomy_tables, plan_search, terminal
 from lungaccess.cli import app as cli
 from lungaccess.cli.exit_code import ExitCode
-from lungaccess.cli.options import OutputOptions
 from lungaccess.plans.plan import Plan
 from lungaccess.plans.version import software_version
 from lungaccess.problem.system import shipped_names
@@ -34,13 +36,45 @@ WITHOUT_RESULT = {"benchmark synthetic-v1 schema", "completion", "template"}
 def test_every_command_has_one_style_of_json() -> None:
     found = commands()
     assert {"plan", "demo", "info", "export", "doctor", "tour"} <= set(found)
-    options = {name: inspect.signature(function).parameters for name, function in found.items()}
-    assert {name for name, each in options.items() if "output" not in each} == WITHOUT_RESULT
-    assert not [name for name, each in options.items() if "json" in each]
-    for name in set(found) - WITHOUT_RESULT:
-        option = options[name]["output"]
-        assert isinstance(option.default, OutputOptions) and not option.default.json, name
-        assert option.kind == option.KEYWORD_ONLY, name
+    assert {name for name, function in found.items() if function in cli.WITHOUT_JSON} == WITHOUT_RESULT
+    for name, function in found.items():
+        assert not {"json", "cache", "quiet"} & set(inspect.signature(function).parameters), name
+        tells = re.search(r"\b(tell|_show_sheet|plan_and_report|_remove)\(", inspect.getsource(function))
+        assert bool(tells) is (name not in WITHOUT_RESULT), name
+
+
+@pytest.mark.parametrize(
+    "words", ["template study", "completion bash", "benchmark synthetic-v1 schema", "study"]
+)
+@pytest.mark.parametrize("before", [True, False])
+def test_what_answers_nothing_refuses_json(
+    words: str, before: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["--json", *words.split()] if before else [*words.split(), "--json"]
+    assert cli.main(asked) == ExitCode.BAD_INPUT
+    said = json.loads(capsys.readouterr().out)["error"]
+    assert said["kind"] == "UsageError" and "--json" in said["found"]
+    assert f"`lungaccess {words.removesuffix(' study').removesuffix(' bash')} --help`" in said["remedy"]
+
+
+@pytest.mark.parametrize("known", ["nowhere/known", None])
+def test_the_cache_is_stated_for_one_command(
+    known: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("LUNGACCESS_CACHE", raising=False)
+    if known is not None:
+        monkeypatch.setenv("LUNGACCESS_CACHE", known)
+    here = str(tmp_path / "cache")
+    for words in (["cache", "--cache", here], ["--cache", here, "cache"], [f"--cache={here}", "cache"]):
+        assert answer_of(words, capsys)["folder"] == here
+        assert os.environ.get("LUNGACCESS_CACHE") == known
+    assert answer_of(["cache"], capsys)["folder"] == str(default_cache())
+    assert cli.main(["cache", "prune", "--max-size", "big", "--cache", here]) == ExitCode.BAD_INPUT
+    assert os.environ.get("LUNGACCESS_CACHE") == known
+    capsys.readouterr()
+    assert cli.main(["plan", "PATIENT", "--cache"]) == ExitCode.BAD_INPUT
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--cache has no value" in said and "`lungaccess plan --help`" in said
 
 
 def test_presets_as_json(capsys: pytest.CaptureFixture[str]) -> None:

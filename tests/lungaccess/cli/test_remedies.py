@@ -14,7 +14,7 @@ import pytest
 from anatomy.base.errors import AnatomyError, TargetError
 from anatomy.io.patients import load_patient
 from anatomy.lung import Lung
-from lungaccess.cli.app import main
+from lungaccess.cli.app import app, main
 from lungaccess.cli.exit_code import ExitCode
 from lungaccess.planning.one_stage.needle import reason_in_words
 from lungaccess.problem.system import load_system
@@ -63,6 +63,7 @@ def test_commands_that_remedies_name_are_there() -> None:
 
 def test_options_that_remedies_name_are_there() -> None:
     known = {option for name in commands() for argument in arguments_of(name) for option in argument.names}
+    known |= {option for argument in app.meta.assemble_argument_collection() for option in argument.names}
     known |= {"--task"}  # TotalSegmentator has this one.
     assert len(named(OPTION)) > 30
     assert set(named(OPTION)) <= known

@@ -89,7 +89,7 @@ def in_the_world(world: World, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
     for console in (terminal.console, terminal.error_console):
         monkeypatch.setattr(console, "_width", 400)
     yield
-    terminal.set_quiet(False)
+    terminal.set_answers()
 
 
 def judge(words: list[str], code: int, out: str, err: str) -> None:

@@ -156,7 +156,7 @@ def wrong_words(draw: st.DrawFn, world: World) -> list[str]:
     fault = draw(st.sampled_from(kinds))
     wrong = draw(_faults(fault, name, words, arguments, world))
     if "completion" not in wrong[:1] and "template" not in wrong[:1] and draw(st.booleans()):
-        wrong = [*wrong, "--json"]
+        wrong = [*wrong, "--json"] if draw(st.booleans()) else ["--json", *wrong]
     return ["--quiet", *wrong] if draw(st.booleans()) else wrong
 
 
@@ -179,7 +179,7 @@ def _faults(
         options = [
             each.name for each in arguments if kind_of(each) is not bool and each.name.startswith("--")
         ]
-        options = [option for option in options if option not in ("--nodule", *words)]
+        options = [option for option in (*options, "--cache") if option not in ("--nodule", *words)]
         if options:
             return st.sampled_from(options).map(lambda option: [*words, option])
     if fault == "two targets":

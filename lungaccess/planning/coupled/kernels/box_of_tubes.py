@@ -8,8 +8,8 @@ are is for each kind of box to say.  docs/theory/unreachable.md derives the boun
 import math
 from typing import NamedTuple
 
+import stages.tube.kernels as kernels
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
-from stages.tube import kernels
 
 Vector = tuple[float, float, float]
 

@@ -13,11 +13,11 @@ import math
 
 import numpy as np
 
+import stages.tube.kernels as kernels
 from anatomy.kernels.arcs import arc_to_point, pose_on_arc
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from lungaccess.planning.coupled.kernels.tubes_cost import bent_towards, cost_in_tissue
 from stages.needle.kernels import blocker_on_arc, cost_of_arc, least_cosine, map_costs_on_arc
-from stages.tube import kernels
 
 SCOPE_POSE = 0
 ROTATION = 1

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+import stages.tube.kernels as kernels
 from anatomy.kernels.compiling import inner_kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance, most_distance
 from anatomy.kernels.labels import BRANCH_SHIFT, LUMEN
@@ -25,7 +26,6 @@ from lungaccess.planning.coupled.kernels.box_of_tubes import (
     times,
     tubes_of,
 )
-from stages.tube import kernels
 
 ACROSS, UP, SIDES = 0, 1, 5
 BOUND, TIP, AWAY, WIDE, LOSS = 5, 6, 7, 13, 14

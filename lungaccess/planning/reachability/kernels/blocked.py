@@ -4,12 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+import stages.tube.kernels as kernels
 from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
 from anatomy.kernels.field import distance_bound, exact_distance
 from anatomy.kernels.labels import LUMEN
 from lungaccess.planning.coupled.kernels.box_of_tubes import HALF, INNER, OUTER, SPARE, minus, sample_of
 from stages.needle.infeasibility.kernels import BackwardReach, never_along
-from stages.tube import kernels
 
 LOOK_STEP_MM, FARTHEST_LOOK_MM = 5.0, 40.0
 """The path of the needle is looked at in such steps, as long as it is known so well."""

@@ -22,7 +22,7 @@ EXCLUDED_SHARE, TOUCHING_SHARE = 0.05, 0.5
 surface at least the second share touches the lungs.  Vessels that lie elsewhere do not touch them."""
 
 
-def with_lobes(masks: MaskSet) -> MaskSet:
+def _with_lobes(masks: MaskSet) -> MaskSet:
     """Make lungs and fissures of lobes, as far as they have no masks of their own.
 
     The lungs are the union of the lobes, see `fill_lung`.  A fissure lies on both sides of every border
@@ -80,7 +80,7 @@ def fill_lung(masks: MaskSet) -> MaskSet:
     return replace(masks, masks={**masks.masks, "lung": lung})
 
 
-def with_contents(masks: MaskSet) -> MaskSet:
+def _with_contents(masks: MaskSet) -> MaskSet:
     """Count what a mask of the lungs leaves out of them as lung, where it has the air alone.
 
     A label map cannot have a voxel twice, so that its lungs have holes where vessels, airways, fissures and
@@ -121,7 +121,7 @@ def assemble(masks: MaskSet, *, name: str, kind: str, where: Path, **others: Any
     to.  Raises AnatomyError if lumen, vessels or lung is missing, or a mask is empty.  An empty mask of
     fissures or nodules only causes a warning.
     """
-    masks = with_contents(with_lobes(masks))
+    masks = _with_contents(_with_lobes(masks))
     missing = [words for role, words in LUNG_ROLES.items() if role not in masks.masks]
     if missing:
         raise AnatomyError(

@@ -32,7 +32,7 @@ _APPENDED = re.compile(rb"<AppendedData\s+encoding\s*=\s*[\"'](\w+)[\"']\s*>\s*_
 
 
 @frozen_record
-class VtkPiece:
+class _VtkPiece:
     """The arrays of one piece: points, point data by name, cells as connectivity and offsets."""
 
     points: Array
@@ -61,7 +61,7 @@ class _Reader:
         self.order = "<" if self.root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
         self.header = np.dtype(self.order + _HEADER_TYPES[self.root.get("header_type", "UInt32")])
 
-    def contents(self) -> tuple[list[VtkPiece], dict[str, Array]]:
+    def contents(self) -> tuple[list[_VtkPiece], dict[str, Array]]:
         """Return the pieces of the file, and its field data by name."""
         kind = self.root.get("type", "")
         if self.root.tag != "VTKFile" or kind not in ("PolyData", "UnstructuredGrid"):
@@ -73,7 +73,7 @@ class _Reader:
         pieces = [self.piece(piece, cells) for piece in data.iter("Piece")]
         return pieces, self.named(self.root.find("FieldData")) | self.named(data.find("FieldData"))
 
-    def piece(self, piece: Element, cells: str) -> VtkPiece:
+    def piece(self, piece: Element, cells: str) -> _VtkPiece:
         count = int(piece.get("NumberOfPoints", "0"))
         points = next(iter(self.named(piece.find("Points")).values()), np.zeros((0, 3))).reshape(-1, 3)
         point_data = self.named(piece.find("PointData"))
@@ -86,7 +86,7 @@ class _Reader:
         beyond = len(offsets) and (offsets[-1] > len(connectivity) or (np.diff(offsets, prepend=0) < 0).any())
         if beyond or ((connectivity < 0) | (connectivity >= count)).any():
             raise ValueError("the cells refer to points that are not listed")
-        return VtkPiece(
+        return _VtkPiece(
             points=points,
             point_data=point_data,
             connectivity=connectivity,
@@ -234,7 +234,7 @@ def _frame(field_data: dict[str, Array], path: str | Path, given: Frame | None) 
     return found or given or "lps"
 
 
-def _radius(piece: VtkPiece, path: str | Path) -> Float:
+def _radius(piece: _VtkPiece, path: str | Path) -> Float:
     name = next((name for name in RADIUS_NAMES if name in piece.point_data), None)
     if name is None:
         raise FileError(
@@ -252,7 +252,7 @@ def _radius(piece: VtkPiece, path: str | Path) -> Float:
     return radius
 
 
-def _edges(piece: VtkPiece, path: str | Path) -> Int:
+def _edges(piece: _VtkPiece, path: str | Path) -> Int:
     """Return the pairs of points `(E, 2)` that follow each other on a line."""
     types = piece.cell_types
     if types is not None and not np.isin(types, (3, 4)).all():

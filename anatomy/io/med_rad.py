@@ -154,13 +154,13 @@ def require_roles(folder: Path, sources: list[MaskSource]) -> None:
         files = ", ".join(f"{LUNG_FILES[role][0]}.nii.gz ({what})" for role, what in LUNG_ROLES.items())
         raise AnatomyError(
             f"{folder} holds some masks of lungs, but no mask of {words}. "
-            f"{missing_files(folder, missing, sources)}",
+            f"{_missing_files(folder, missing, sources)}",
             expected=f"{files}; instead of pleuralBoundary also the lobes LUL, LLL, RUL, RML, RLL",
             remedy=DESCRIBE_YOURSELF,
         )
 
 
-def missing_files(folder: Path, missing: list[str], sources: list[MaskSource]) -> str:
+def _missing_files(folder: Path, missing: list[str], sources: list[MaskSource]) -> str:
     """Say of each missing role which image of the folder looks like it, and what else is there."""
     used = {source.path for source in sources}
     unused = {name: path for name, path in by_name(folder).items() if path not in used}

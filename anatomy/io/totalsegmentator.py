@@ -39,12 +39,12 @@ def stored_names(path: Path) -> dict[int, str]:
     for sidecar in (f"{stem}.json", f"{stem}_labels.json", *(shared := ("labels.json", "dataset.json"))):
         if not names and (path.parent / sidecar).is_file():
             names = _sidecar_names(path.parent / sidecar)
-            if sidecar in shared and not label_values(path) <= {0, *names}:
+            if sidecar in shared and not _label_values(path) <= {0, *names}:
                 names = {}
     return names
 
 
-def label_values(path: Path) -> set[float]:
+def _label_values(path: Path) -> set[float]:
     """Return the values that occur in an image."""
     values: set[float] = set()
     for plane in read_volume(path).array.T:
@@ -68,7 +68,7 @@ def _sidecar_names(path: Path) -> dict[int, str]:
     return names
 
 
-def published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int, str], str]:
+def _published_names(stem: str, values: set[float], path: Path) -> tuple[dict[int, str], str]:
     """Name the labels of a TotalSegmentator file that stores no names, and say which table was used.
 
     Of a file whose name begins with "total" the task total is meant; `values` are those that occur.  Raises
@@ -179,11 +179,11 @@ def _label_names(path: Path, *, must_have: bool) -> tuple[dict[int, str], list[s
     stem = image_stem(path)
     if stem != "lung_vessels" and not must_have and not stem.startswith("total"):
         return {}, []
-    values = label_values(path)
+    values = _label_values(path)
     is_mask = values <= {0, 1} or any(value % 1 for value in values)
     if stem == "lung_vessels" and (is_mask or (len(values) == 2 and not values <= {0, *LUNG_VESSELS})):
         return {}, []
-    table, statement = published_names(stem, values, path)
+    table, statement = _published_names(stem, values, path)
     return table, [statement]
 
 

@@ -29,7 +29,7 @@ def generation() -> str:
 
 
 @cache
-def prebuilt_folder() -> Path | None:
+def _prebuilt_folder() -> Path | None:
     """Return the folder of code that was made beforehand for this numba and Python, if there is one."""
     # Package with machine code that was made beforehand.
     spec = util.find_spec("lungaccess_kernels")
@@ -44,7 +44,7 @@ def prebuilt_folder() -> Path | None:
 
 def code_folders() -> tuple[Path, ...]:
     """Return where code is looked for, in this order; new code is kept in the last."""
-    prebuilt = prebuilt_folder()
+    prebuilt = _prebuilt_folder()
     return (*(() if prebuilt is None else (prebuilt,)), kernels_folder() / generation())
 
 

@@ -85,7 +85,7 @@ def _of_landmarks(
     points = exhale + source.masks_phase * vectors
     is_left = points[:, 0] > middle_x_mm
     fits = {
-        side: fit_landmarks(points[chosen], vectors[chosen], SIDES[side])
+        side: _fit_landmarks(points[chosen], vectors[chosen], SIDES[side])
         for side, chosen in ((RIGHT, ~is_left), (LEFT, is_left))
     }
     left_out = np.concatenate([fit.left_out_mm for fit in fits.values()])
@@ -283,7 +283,7 @@ class Fitted:
     left_out_mm: Float
 
 
-def fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
+def _fit_landmarks(points: Float, vectors: Float, lung: str) -> Fitted:
     """Fit a thin-plate spline with the smoothness by which each half of the pairs predicts the other.
 
     Places in the masks `(N, 3)` LPS mm have displacements `(N, 3)` mm; `lung` says whose they are, for

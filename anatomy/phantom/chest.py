@@ -27,7 +27,7 @@ def _bump(u: Array, centre: float, width: float) -> Array:
     return np.exp(-(((u - centre) / width) ** 2))
 
 
-def smooth_maximum(a: Array, b: Array, width: float) -> Array:
+def _smooth_maximum(a: Array, b: Array, width: float) -> Array:
     """Return max(a, b) with the kink rounded over `width`; never below the true maximum."""
     overlap = np.maximum(width - np.abs(a - b), 0)
     return np.asarray(np.maximum(a, b) + overlap * overlap / (4 * width))
@@ -122,9 +122,9 @@ class Chest:
         heart = 4 - self.heart(x, y, z) / s
         x, y, z = x / s, y / s, z / s
         medial = 0.9 * (side.mediastinum(y, z) - side.sign * x)
-        level = smooth_maximum(side.cage(x, y, z), medial, EDGE_ROUNDING_MM)
-        level = smooth_maximum(level, heart, EDGE_ROUNDING_MM)
-        level = smooth_maximum(level, 0.75 * (side.diaphragm(x, y) - z), 0.5 * EDGE_ROUNDING_MM)
+        level = _smooth_maximum(side.cage(x, y, z), medial, EDGE_ROUNDING_MM)
+        level = _smooth_maximum(level, heart, EDGE_ROUNDING_MM)
+        level = _smooth_maximum(level, 0.75 * (side.diaphragm(x, y) - z), 0.5 * EDGE_ROUNDING_MM)
         return np.asarray(s * level)
 
     def lobe(self, side: Side, x: Array, y: Array, z: Array) -> Array:

@@ -142,7 +142,7 @@ def make_phantom(
         size=size,
         images=_images(canvas, f"phantom {size} {seed}", plan.nodules, hilar if from_mm else None),
         # The noise comes last of all draws, and from a copy, so that it is the same whenever it is asked for.
-        render=lambda: simulate_ct(canvas, noise_hu, deepcopy(rng)),
+        render=lambda: _simulate_ct(canvas, noise_hu, deepcopy(rng)),
         labels=Volume(grid=canvas.grid, array=canvas.labels),
         lobes=Volume(grid=canvas.grid, array=canvas.lobes),
         centerlines=MappingProxyType(lines),
@@ -227,7 +227,7 @@ LEAST_HU, GREATEST_HU = -1024, 3071
 """Range of a CT of 12 bits."""
 
 
-def simulate_ct(canvas: Canvas, noise_hu: float, rng: np.random.Generator) -> Volume:
+def _simulate_ct(canvas: Canvas, noise_hu: float, rng: np.random.Generator) -> Volume:
     """Return the int16 CT in HU: shares, 0.6 mm point spread, noise; on the back, lung is denser at +y."""
     from scipy.ndimage import gaussian_filter
 

@@ -251,7 +251,7 @@ def plan_patient(
     return PatientPlan(airways=airways, arteries=arteries, veins=veins, nodules=nodules, bullae=bullae)
 
 
-def wall_thickness_mm(diameter_mm: Float) -> Float:
+def _wall_thickness_mm(diameter_mm: Float) -> Float:
     """Return the wall thickness for lumen diameters: about 20 % of thin airways, 10 % of wide ones."""
     # About the wall of a bronchus of 2 mm.
     return np.asarray(np.maximum(0.5, diameter_mm * (0.1 + 0.1 * np.exp(-diameter_mm / 6.0))))
@@ -269,7 +269,7 @@ def _plan_airways(sprouts: Sprouts, spacing_mm: float) -> PlannedTree:
     limit = max(1.8, 2 * GAPLESS_RADIUS * spacing_mm)
     drawn = sprouts.pruned(np.array(sprouts.diameter_mm) >= limit)
     diameter = np.repeat(drawn.diameter_mm, drawn.counts)
-    outer = 0.5 * diameter + wall_thickness_mm(diameter)
+    outer = 0.5 * diameter + _wall_thickness_mm(diameter)
     return PlannedTree(sprouts=drawn, inner_mm=0.5 * diameter, outer_mm=outer, freedom=_freedom(drawn))
 
 
@@ -298,7 +298,7 @@ def _plan_arteries(
     # Pulmonary trunk, right and left pulmonary artery of an adult.
     radius[:CENTRAL_BRANCHES] = scale * np.array((12.5, 9.5, 9.5))
     diameter = np.array(airways.diameter_mm)
-    outer = 0.5 * diameter + wall_thickness_mm(diameter)
+    outer = 0.5 * diameter + _wall_thickness_mm(diameter)
     arteries = copy_arteries(airways, outer, radius, scale)
     obstacles = Obstacles(centres=np.vstack(airways.points), radii=np.repeat(outer, airways.counts))
     fixed = int(arteries.counts[:CENTRAL_BRANCHES].sum())

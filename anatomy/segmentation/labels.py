@@ -58,7 +58,7 @@ def sides_of(volume: Volume, name: str) -> tuple[Mask, Mask]:
         sides = sides_of_lobes(lobe_numbers(volume, name))
         return sides == LEFT, sides == RIGHT
     if len(values) == 1:
-        left, right = split_sides(np.asfortranarray(volume.array != 0), volume.grid)
+        left, right = _split_sides(np.asfortranarray(volume.array != 0), volume.grid)
         return (right, left) if values == {LEFT} and not left.any() else (left, right)
     raise AnatomyError(
         f"{name} holds the values {sorted(values)[:9]}",
@@ -120,7 +120,7 @@ def _middles(grid: Grid, masks: Iterable[Mask]) -> Float:
     return np.asarray(grid.lps(np.array(found)))
 
 
-def split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
+def _split_sides(mask: Mask, grid: Grid) -> tuple[Mask, Mask]:
     """Return the left and the right lung of a mask of both; one alone counts as right."""
     coarse = CoarseCt.of(Volume(grid=grid, array=mask.astype(np.int16)))
     sides = sides_from_right(np.asfortranarray(coarse.hu >= 0.5), coarse)

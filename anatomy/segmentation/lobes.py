@@ -138,11 +138,11 @@ def _with_fissures(
     fissures = cubic.back(_bands(found, near, seen)) * lungs.mask
     between = fissures_between(lobes)
     fissures[between] = np.where(cubic.back(near), np.uint8(SEEN), np.uint8(BORDER))[between]
-    fissures = without_lobes_unknown(fissures, lobes, lungs)
+    fissures = _without_lobes_unknown(fissures, lobes, lungs)
     return Lobes(lobes=lobes, fissures=fissures, seen=seen, warnings=tuple(warnings))
 
 
-def without_lobes_unknown(fissures: UInt8, lobes: UInt8, lungs: Lungs) -> UInt8:
+def _without_lobes_unknown(fissures: UInt8, lobes: UInt8, lungs: Lungs) -> UInt8:
     """Return fissures that are `UNKNOWN` in a lung of which less than half has a lobe, and nothing else."""
     for side in (lungs.left, lungs.right):
         if np.count_nonzero(lobes[side]) <= 0.5 * np.count_nonzero(side):
@@ -194,7 +194,7 @@ def _sheets(ct: Volume, lungs: Lungs, airways: Airways, vessels: Mask) -> tuple[
 def lobes_given(lobes: UInt8, fissures: UInt8 | None, lungs: Lungs) -> dict[str, UInt8]:
     """Return lobes that a person corrected, and the fissures between them if there are no others."""
     if fissures is None:
-        fissures = without_lobes_unknown((SEEN * fissures_between(lobes)).astype(np.uint8), lobes, lungs)
+        fissures = _without_lobes_unknown((SEEN * fissures_between(lobes)).astype(np.uint8), lobes, lungs)
     return {"lobes": lobes, "fissures": fissures}
 
 

@@ -85,10 +85,10 @@ def segment_lungs(
         added = (None, None)
     else:
         tell("lungs: trachea")
-        coarse, outside, scale, airways = in_hounsfield(coarse, seed)
+        coarse, outside, scale, airways = _in_hounsfield(coarse, seed)
         ct = scale.image(ct)
         tell("lungs: left and right")
-        threshold = lung_threshold(coarse.hu, outside)
+        threshold = _lung_threshold(coarse.hu, outside)
         airway, tissue = _airway_and_lung(coarse, outside, airways, threshold)
         gas, tissue = gas_pockets(coarse, tissue, air_in_hu(coarse, airway.grown))
         sides, warnings = _coarse_sides(coarse, tissue, airway)
@@ -118,7 +118,7 @@ def lungs_given(ct: Volume, left: Mask, right: Mask, *, seed_lps: ArrayLike | No
     Raises AnatomyError if there is no trachea.
     """
     seed = None if seed_lps is None else np.asarray(seed_lps, dtype=np.float64)
-    coarse, _, scale, airways = in_hounsfield(CoarseCt.of(ct), seed)
+    coarse, _, scale, airways = _in_hounsfield(CoarseCt.of(ct), seed)
     ct, airway = scale.image(ct), next(airways)
     main = _on_ct(coarse, near(airway.main, WALL_MM, coarse.spacing_mm))
     left, right = (_filled(side, ct.grid) & ~main for side in (left, right))
@@ -141,7 +141,7 @@ def _on_ct(coarse: CoarseCt, mask: Mask) -> Mask:
     return whole
 
 
-def lung_threshold(hu: Float32, outside: Mask) -> float:
+def _lung_threshold(hu: Float32, outside: Mask) -> float:
     """Return the middle between the median of the lung and that of soft tissue, in HU."""
     lung = hu[(hu < FIRST_THRESHOLD_HU) & ~outside]
     tissue = hu[(hu > TISSUE_HU[0]) & (hu < TISSUE_HU[1])]
@@ -156,7 +156,7 @@ def lung_threshold(hu: Float32, outside: Mask) -> float:
     return float(np.clip(middle, -600.0, -300.0))
 
 
-def in_hounsfield(
+def _in_hounsfield(
     coarse: CoarseCt, seed: Float | None
 ) -> tuple[CoarseCt, Mask, Scale, Iterator[CentralAirway]]:
     """Return the coarse CT in Hounsfield units, the air around the patient, how its values became them, and
@@ -262,11 +262,11 @@ def _parted(
         central_airway=_on_ct(coarse, airway.main) & (ct.array < threshold),
         threshold_hu=threshold,
         scale=scale,
-        warnings=(*said, *truncation(left | right, ct.grid)),
+        warnings=(*said, *_truncation(left | right, ct.grid)),
     )
 
 
-def truncation(lung: Mask, grid: Grid) -> tuple[str, ...]:
+def _truncation(lung: Mask, grid: Grid) -> tuple[str, ...]:
     """Warn of each face of the image that cuts the lung off."""
     names = (("right", "left"), ("front", "back"), ("lower end", "upper end"))
     found = []

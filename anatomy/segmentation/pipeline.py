@@ -107,7 +107,7 @@ def segment(
     parts = steps.run()
     if parts.nodule.any() and target is None:
         target = centre_of(parts.nodule, parts.ct.grid)
-    warnings += [*steps.warnings, *target_warnings(target, parts, grid)]
+    warnings += [*steps.warnings, *_target_warnings(target, parts, grid)]
     folder.save(provenance=_provenance(request, steps, warnings))
     thick_mm = slice_mm(request.ct) if has_thick_slices(request.ct) else 0.0
     # A given mask says itself which vessels are obstacles, and of its border nothing is known.
@@ -140,7 +140,7 @@ def segment(
     )
 
 
-def target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> list[str]:
+def _target_warnings(target_lps: Float | None, parts: Parts, ct_grid: Grid) -> list[str]:
     """Warn of a target that lies outside the lungs or in an obstacle."""
     if target_lps is None:
         return []

@@ -110,7 +110,7 @@ class ScaleSpace:
 
     def share(self, work: Callable[[int, int], None], axis: int = 0) -> None:
         """Call `work(first, last)` for the parts of an axis; each voxel is written by one call alone."""
-        share_axis(work, self.hu.shape[axis], self.threads)
+        _share_axis(work, self.hu.shape[axis], self.threads)
 
     def whole(self, part: Array, shape: tuple[int, ...]) -> Array:
         """Return an image of the whole grid, `[i, j, k]`, 0 outside the box."""
@@ -119,7 +119,7 @@ class ScaleSpace:
         return image
 
 
-def share_axis(work: Callable[[int, int], None], length: int, threads: int) -> None:
+def _share_axis(work: Callable[[int, int], None], length: int, threads: int) -> None:
     """Call `work(first, last)` for parts of `range(length)`, in threads if there are more than one."""
     parts = np.linspace(0, length, 4 * threads + 1).astype(np.int64) if threads > 1 else np.array([0, length])
     spans = [(int(a), int(b)) for a, b in zip(parts, parts[1:], strict=False) if b > a]
@@ -206,14 +206,14 @@ def segment_vessels(
     space = ScaleSpace.of(ct.array, lungs, ct.grid.spacing_mm, threads=threads)
     airway = np.ascontiguousarray((airways.lumen[space.box] | airways.wall[space.box]).T)
     lung_hu = space.hu[space.n_scales > 0]
-    solid = space.hu >= towards_blood(lung_hu, SOLID_SHARE)
+    solid = space.hu >= _towards_blood(lung_hu, SOLID_SHARE)
     best, response, at_scale = _responses(space, solid & ~airway, progress)
     large = _large(space, solid, airway, response, at_scale, large_radius_mm)
     del response, at_scale
     warnings = () if large.any() else ("No large vessel was found: is the CT one of the chest?",)
     large |= _hilum(space, solid, airways)
     best[airway] = 0.0
-    edges = (space.hu >= towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
+    edges = (space.hu >= _towards_blood(lung_hu, EDGE_SHARE)) & ~airway & (space.n_scales > 0)
     # How far the response of a vessel's core carries to its edge.
     for _ in range(2):
         raised = best.copy()
@@ -230,7 +230,7 @@ def segment_vessels(
     )
 
 
-def towards_blood(lung_hu: Int16 | Float32, share: float) -> float:
+def _towards_blood(lung_hu: Int16 | Float32, share: float) -> float:
     """Return HU a share of the way from lung median to blood without contrast (with it: the safe side)."""
     median = float(np.median(lung_hu))
     return median + share * (BLOOD_HU - median)
@@ -249,7 +249,7 @@ def _responses(
     for scale, (sigma, image) in enumerate(space.images()):
         if progress is not None:
             progress(f"vessels: scale {sigma:.1f} mm")
-        add_vesselness_of(space, scale, sigma, image, settings, best)
+        _add_vesselness_of(space, scale, sigma, image, settings, best)
         # R_L is raised where `solid_scales` lets this scale apply, and the scale is noted.
         given = (solid_scales, np.int64(scale), space.hessian_factors(sigma), *limits, response, at_scale)
         space.share(partial(_add_large, image, space.hu, given))
@@ -361,11 +361,11 @@ def vesselness(hu: Int16 | Float32, lung: Mask, spacing_mm: ArrayLike, *, thread
     best = np.zeros(space.hu.shape, dtype=np.float32)
     settings = np.array([ALPHA, BETA, C_HU])
     for scale, (sigma, image) in enumerate(space.images()):
-        add_vesselness_of(space, scale, sigma, image, settings, best)
+        _add_vesselness_of(space, scale, sigma, image, settings, best)
     return space.whole(best, hu.shape)
 
 
-def add_vesselness_of(
+def _add_vesselness_of(
     space: ScaleSpace, scale: int, sigma: float, image: Float32, settings: Float, best: Float32
 ) -> None:
     """Raise `best` to the response at one scale; `settings` are alpha, beta, c."""

@@ -139,7 +139,7 @@ def assemble(strands: list[Strand], report: TreeReport) -> AirwayTree:
         parent_point[start[b]] = hook
         line = strand.points_lps if hook < 0 else np.vstack((points[hook], strand.points_lps))
         along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))))
-        direction = smooth_tangents(line, along)
+        direction = _smooth_tangents(line, along)
         offset = 0 if hook < 0 else 1
         own = slice(int(start[b]), int(start[b + 1]))
         distance[own] = along[offset:] + (0.0 if hook < 0 else distance[hook])
@@ -158,7 +158,7 @@ def assemble(strands: list[Strand], report: TreeReport) -> AirwayTree:
     )
 
 
-def smooth_tangents(line: Float, along_mm: Float) -> Float:
+def _smooth_tangents(line: Float, along_mm: Float) -> Float:
     """Return the directions `(n, 3)` of a polyline, averaged over `TANGENT_REACH_MM` on both sides."""
     ahead = np.minimum(along_mm + TANGENT_REACH_MM, along_mm[-1])
     behind = np.maximum(along_mm - TANGENT_REACH_MM, 0.0)

@@ -54,7 +54,7 @@ def join_pieces(main: Int, pieces: list[Piece], spacing_mm: Float, max_gap_mm: f
         open_pieces.remove(chosen)
         yield Join(
             voxels=voxels,
-            bridge=face_connected_line(gap.begin, gap.end),
+            bridge=_face_connected_line(gap.begin, gap.end),
             middle_ijk=(gap.begin + gap.end) / 2,
             length_mm=gap.length_mm,
         )
@@ -125,7 +125,7 @@ def _towards(voxels: Int, contact: Int, spacing_mm: Float) -> Float:
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
 
 
-def face_connected_line(begin: Int, end: Int) -> Int:
+def _face_connected_line(begin: Int, end: Int) -> Int:
     """Return the voxels of a straight line, each sharing a face with the next, `(M, 3)`."""
     steps = 4 * int(np.abs(end - begin).max()) + 1
     line = np.rint(begin + np.linspace(0, 1, steps + 1)[:, None] * (end - begin)).astype(np.int64)

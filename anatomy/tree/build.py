@@ -55,7 +55,7 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
     spurs = prune(skeleton, grid.spacing_mm)
     trunk = find_trachea(skeleton, grid.lps_from_ijk[:3, :3] / grid.spacing_mm)
     voxel_tree = rooted_voxel_tree(skeleton, trunk.nodes[0], trunk.nodes[-1], prepared)
-    voxel_tree = unite_parallel(around_cavities(voxel_tree, prepared), prepared.lumen)
+    voxel_tree = unite_parallel(_around_cavities(voxel_tree, prepared), prepared.lumen)
     # Lines that centring has drawn together are one line too.
     voxel_tree = unite_parallel(centred(voxel_tree, prepared, ROUNDS), prepared.lumen)
     voxel_tree = centred(voxel_tree, prepared, ROUNDS // 3)
@@ -70,7 +70,7 @@ def tree_from_mask(lumen: Volume) -> AirwayTree:
             for a, b, length in rings
         ),
     )
-    return _tree_of(strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
+    return _tree_of(_strands_along(voxel_tree, prepared, spacing_mm=0.75), report)
 
 
 def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike) -> AirwayTree:
@@ -85,7 +85,7 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
         radius_mm: (N,) float64.
         edges ((E, 2) int64): Pairs of points that are neighbours along a branch.
     """
-    skeleton, report = spanned_graph(points_lps, radius_mm, edges)
+    skeleton, report = _spanned_graph(points_lps, radius_mm, edges)
     trunk = find_trachea(skeleton, np.eye(3))
     # Nodes with parents first, and the position of each one's parent among them.
     order, above, came_from = [trunk.nodes[0]], [-1], [-1]
@@ -104,7 +104,7 @@ def tree_from_graph(points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLik
 
 def _tree_of(strands: list[Strand], report: TreeReport) -> AirwayTree:
     tree = assemble(strands, report)
-    return replace(tree, report=replace(report, warnings=warnings_of(tree)))
+    return replace(tree, report=replace(report, warnings=_warnings_of(tree)))
 
 
 def _contacts(voxel_tree: VoxelTree, prepared: PreparedLumen) -> tuple[GapBridged, ...]:
@@ -123,7 +123,7 @@ ADULT_TRACHEA_MM = (5.0, 14.0)
 """Radii between which the trachea of an adult lies, wide disease included."""
 
 
-def warnings_of(tree: AirwayTree) -> tuple[str, ...]:
+def _warnings_of(tree: AirwayTree) -> tuple[str, ...]:
     """List what is unusual about a tree, one sentence each."""
     found = []
     radius = float(np.median(tree.radius_mm[tree.branch_points(0)]))
@@ -161,7 +161,7 @@ MARGIN_VOXELS = 6
 are."""
 
 
-def around_cavities(voxel_tree: VoxelTree, prepared: PreparedLumen) -> VoxelTree:
+def _around_cavities(voxel_tree: VoxelTree, prepared: PreparedLumen) -> VoxelTree:
     """Replace the positions that lie in cavities by paths through the lumen beside them.
 
     Positions in bridges stay.  A twig that ends in a cavity ends before it.
@@ -220,7 +220,7 @@ def _path(prepared: PreparedLumen, begins: VoxelPath, end: tuple[int, ...]) -> V
     return [tuple((np.array(step) + low).tolist()) for step in search.traceback(target)]
 
 
-def spanned_graph(
+def _spanned_graph(
     points_lps: ArrayLike, radius_mm: ArrayLike, edges: ArrayLike
 ) -> tuple[SkeletonTree, TreeReport]:
     """Check the arrays of a graph, unite equal points, keep the largest piece and open its rings."""
@@ -294,7 +294,7 @@ def _largest_piece(points: Float, radius: Float, pairs: Int) -> tuple[Float, Flo
     return points[keep], radius[keep], new[inner], int(label.max()), int(len(points) - keep.sum())
 
 
-def strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
+def _strands_along(voxel_tree: VoxelTree, prepared: PreparedLumen, spacing_mm: float) -> list[Strand]:
     """Resample the branches of a voxel tree and measure their radius."""
     voxel_mm = prepared.grid.spacing_mm
     mm = voxel_tree.ijk * voxel_mm

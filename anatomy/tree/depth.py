@@ -38,7 +38,7 @@ def segments_inside(lumen: Bool, begin_ijk: Float, end_ijk: Float) -> Bool:
     return np.asarray(inside(lumen, samples[:, :, None] + _SIGNS).all(axis=(1, 2)))
 
 
-def border_voxels(lumen: Bool) -> Int:
+def _border_voxels(lumen: Bool) -> Int:
     """Return the voxels `(M, 3)` outside `lumen` that share a face with it.
 
     `lumen` must have an empty layer all around.  The nearest solid box outside the lumen is always
@@ -61,7 +61,7 @@ def exact_depth_mm(lumen: Bool, spacing_mm: Float, ijk: Float) -> Float:
     """Return the distance of `(N, 3)` (voxels) to boxes outside `lumen`, empty at its edges; 0 outside."""
     from scipy.spatial import KDTree
 
-    boxes = border_voxels(lumen) * spacing_mm
+    boxes = _border_voxels(lumen) * spacing_mm
     tree = KDTree(boxes)
     points = ijk * spacing_mm
     half_diagonal = float(np.linalg.norm(spacing_mm)) / 2

@@ -48,7 +48,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     """
     from scipy import ndimage
 
-    grid, box = crop_to_content(mask)
+    grid, box = _crop_to_content(mask)
     labels, count = ndimage.label(box, CONNECT_26)
     sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
     main = int(np.argmax(sizes[1:])) + 1
@@ -78,14 +78,14 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     outside, holes = ndimage.label(~solid)
     solid = solid if holes < 2 else np.asarray(outside != outside[0, 0, 0])
     cavity_voxels = int(solid.sum()) - int((lumen | bridges).sum())
-    depth = depth_of_centres(lumen, grid.spacing_mm)
+    depth = _depth_of_centres(lumen, grid.spacing_mm)
     return PreparedLumen(
         grid=grid,
         lumen=lumen,
         solid=solid,
         bridges=bridges,
         depth_mm=depth,
-        solid_depth_mm=depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
+        solid_depth_mm=_depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
         report=TreeReport(
             gaps_bridged=tuple(gaps),
             pieces_left_out=left_out,
@@ -120,7 +120,7 @@ def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOu
     return tuple(found)
 
 
-def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
+def _crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     """Return grid and array of the bounding box of a mask, with one empty layer all around."""
     array = np.asarray(mask.array != 0) if mask.array.dtype != bool else mask.array
     start, stop = bounds(array)
@@ -135,7 +135,7 @@ def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     return mask.grid.crop(start - 1, stop + 1), box
 
 
-def depth_of_centres(mask: Bool, spacing_mm: Float) -> Float32:
+def _depth_of_centres(mask: Bool, spacing_mm: Float) -> Float32:
     """Return the distance of every voxel centre in `mask` to the nearest one outside it, mm."""
     import edt
 

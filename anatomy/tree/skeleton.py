@@ -244,7 +244,7 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
     `lps_from_mm` (3, 3) turns the directions of the tree's own frame into LPS.  Raises AnatomyError if
     nothing is like a trachea: the message says what is there instead.
     """
-    trunks = [follow_trunk(tree, end) for end in tree.ends()]
+    trunks = [_follow_trunk(tree, end) for end in tree.ends()]
     # A trachea is about twelve radii long; of one that the image cuts, a quarter is enough to know it by.
     long_ones = [t for t in trunks if t.divides and t.length_mm >= 3.0 * t.radius_mm]
     if not long_ones:
@@ -276,7 +276,7 @@ def find_trachea(tree: SkeletonTree, lps_from_mm: Float) -> Trunk:
     return trunk
 
 
-def follow_trunk(tree: SkeletonTree, end: int) -> Trunk:
+def _follow_trunk(tree: SkeletonTree, end: int) -> Trunk:
     """Follow the tree from an end to the first place where it divides into two wide branches."""
     nodes = tree.chain(end, tree.neighbours[end][0])
     while True:

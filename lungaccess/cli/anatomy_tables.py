@@ -56,7 +56,7 @@ def organ_record(lung: lazy.Organ) -> dict[str, Any]:
             "lps_from_ijk": lung.grid.lps_from_ijk.tolist(),
         },
         "breath_hold": lung.breath_hold,
-        "volumes_ml": {name: count * ml for name, count in structure_voxels(lung).items()},
+        "volumes_ml": {name: count * ml for name, count in _structure_voxels(lung).items()},
         "has_cost_map": lung.cost is not None,
         **_breathing(lung),
         "starts": len(lung.starts),
@@ -85,7 +85,7 @@ def organ_record(lung: lazy.Organ) -> dict[str, Any]:
     }
 
 
-def checks_table(lung: lazy.Organ) -> Table:
+def _checks_table(lung: lazy.Organ) -> Table:
     """Return what the checks of the masks found that is not usual, and how many found nothing."""
     ordered = sorted(lung.findings, key=lambda each: VERDICTS.index(each.verdict))
     rows = [(each.verdict, each.name, each.found) for each in ordered if each.verdict != FITS]
@@ -108,7 +108,7 @@ def _airways(lung: lazy.Lung) -> dict[str, Any]:
     tree, named, report = lung.tree, lung.tree.bronchi, lung.tree.report
     ml = lung.grid.voxel_volume_mm3 / 1000.0
     return {
-        "lobes_ml": {name: count * ml for name, count in lobe_voxels(lung).items()},
+        "lobes_ml": {name: count * ml for name, count in _lobe_voxels(lung).items()},
         "tree": {
             "branches": tree.n_branches,
             "carina_lps": tree.carina_lps.tolist(),
@@ -127,7 +127,7 @@ def _airways(lung: lazy.Lung) -> dict[str, Any]:
     }
 
 
-def lobe_voxels(lung: lazy.Lung) -> dict[str, int]:
+def _lobe_voxels(lung: lazy.Lung) -> dict[str, int]:
     """Return how many voxels each lobe has; empty if the patient came without lobes."""
     if lung.lobes is None:
         return {}
@@ -135,7 +135,7 @@ def lobe_voxels(lung: lazy.Lung) -> dict[str, int]:
     return {name: int(counts[number]) for number, name in lazy.LOBES.items() if counts[number]}
 
 
-def structure_voxels(lung: lazy.Organ) -> dict[str, int]:
+def _structure_voxels(lung: lazy.Organ) -> dict[str, int]:
     """Return how many voxels each structure has that is there."""
     from anatomy import structures
 
@@ -163,7 +163,7 @@ def anatomy_tables(lung: lazy.Organ, *, details: bool = False) -> list[Table]:
         terminal.table(f"Patient {lung.name} ({lung.kind})", ("", ""), _patient_rows(lung)),
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         _nodule_table(lung),
-        checks_table(lung),
+        _checks_table(lung),
         *(_tree_tables(lung, details) if is_lung(lung) else ()),
         *(_motion_tables(lung) if is_lung(lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), places),
@@ -283,7 +283,7 @@ def _repairs(lung: lazy.Lung) -> list[tuple[str, lazy.Repair]]:
 
 def _volume_rows(lung: lazy.Organ) -> list[terminal.Row]:
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    counts = structure_voxels(lung) | (lobe_voxels(lung) if is_lung(lung) else {})
+    counts = _structure_voxels(lung) | (_lobe_voxels(lung) if is_lung(lung) else {})
     return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items()]
 
 

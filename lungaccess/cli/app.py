@@ -180,14 +180,14 @@ def _answer(words: list[str]) -> int:
         terminal.console.file.write(START_PAGE)
         return ExitCode.OK
     # Until the words are understood, and where they make no sense.
-    terminal.set_answers(as_json=asks_json(words))
+    terminal.set_answers(as_json=_asks_json(words))
     command = _command_of(words)
     first_compilation.command = command.partition(" ")[0]
     try:
         result_folder.protect_files(words)
         code = app.meta(with_nodule_number(words), exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        return _explain(usage_error(error, command))
+        return _explain(_usage_error(error, command))
     except LungaccessError as error:
         error.expected = error.expected or "input that this command can use"
         error.remedy = error.remedy or _see_help(command)
@@ -218,7 +218,7 @@ def _command_of(words: Sequence[str]) -> str:
 
 
 def _crashed(error: Exception, words: list[str]) -> ExitCode:
-    crash = write_report(error, words, software_version())
+    crash = _write_report(error, words, software_version())
     terminal.show_error(crash, title="crash")
     terminal.tell({"error": crash.to_mapping()})
     return ExitCode.CRASHED
@@ -248,7 +248,7 @@ class CrashError(LungaccessError):
     """The program itself is at fault, whatever the input was."""
 
 
-def write_report(error: Exception, words: Sequence[str], version: str) -> CrashError:
+def _write_report(error: Exception, words: Sequence[str], version: str) -> CrashError:
     """Write what is known of a crash into a file of its own, and return the error that names the file."""
     system = f"Python {platform.python_version()} on {platform.platform()}"
     lines = [f"lungaccess {version}, {system}", f"command: {list(words)!r}", ""]
@@ -275,7 +275,7 @@ class UsageError(LungaccessError):
     """A command or an option is unknown, missing, or has a value that it cannot have."""
 
 
-def usage_error(error: CycloptsError, command: str) -> UsageError:
+def _usage_error(error: CycloptsError, command: str) -> UsageError:
     """Return what is wrong with the words of a command, and which words would be right."""
     error.verbose = False
     found, expected = _found_and_expected(error)
@@ -343,7 +343,7 @@ def _with_home(word: str) -> str:
     return f"{name}={os.path.expanduser(value)}" if mark and name.startswith("--") else word
 
 
-def asks_json(words: Sequence[str]) -> bool:
+def _asks_json(words: Sequence[str]) -> bool:
     """Return whether the words of a command line ask for JSON, also where they make no sense otherwise."""
     asked = False
     for word in words:

@@ -144,7 +144,7 @@ def plan_and_report(lung: lazy.Lung, job: PlanJob) -> ExitCode:
     write_text(job.out / SUMMARY_FILE, terminal.json_text(record))
     if job.guide is not None:
         terminal.console.print(job.guide)
-    show_plan(found, lung, appraisal, advice)
+    _show_plan(found, lung, appraisal, advice)
     lazy.cost_over_time_csv(history, job.out / HISTORY_FILE)
     if job.pictures:
         with progress("drawing the plan"):
@@ -185,11 +185,11 @@ def system_of(plan: lazy.Plan, systems: Sequence[lazy.System]) -> lazy.System:
     return {each.name: each for each in systems}.get(plan.system.name, systems[0])
 
 
-def show_plan(
+def _show_plan(
     plan: lazy.Plan, lung: lazy.Lung, appraisal: lazy.Appraisal, advice: Sequence[lazy.Advice] = ()
 ) -> None:
     """Print a plan, its limits and what would lift its chance; the headline comes last, where it is seen."""
-    terminal.show(plan_tables(plan, lung))
+    terminal.show(_plan_tables(plan, lung))
     terminal.show_warnings(lung.warnings)
     show_findings(appraisal)
     if plan.window is not None:
@@ -198,7 +198,7 @@ def show_plan(
         terminal.say(plan.gap_in_words)
     if plan.system_choice:
         terminal.say(" ".join(plan.system_choice))
-    show_advice(advice, appraisal)
+    _show_advice(advice, appraisal)
     show_headline(appraisal.headline)
 
 
@@ -219,7 +219,7 @@ def no_plan_record(failure: NoPlan) -> dict[str, Any]:
     }
 
 
-def plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
+def _plan_tables(plan: lazy.Plan, lung: lazy.Lung) -> list[Table]:
     """Return the stages of a plan and its costs."""
     scope, tube, place = plan.scope, plan.tube, lazy.target_words(lung, plan.target_lps)
     what, steer = ("the tubes beyond the lumen", "") if plan.needle is None else ("the needle", "steer ")
@@ -274,7 +274,7 @@ def show_findings(appraisal: lazy.Appraisal) -> None:
     for finding in (*appraisal.check.refusals, *appraisal.check.unchecked):
         terminal.say(f"{finding}")
     if appraisal.limits:
-        terminal.show([limits_table(appraisal)])
+        terminal.show([_limits_table(appraisal)])
 
 
 def show_headline(headline: lazy.Headline) -> None:
@@ -288,18 +288,18 @@ def show_headline(headline: lazy.Headline) -> None:
     )
 
 
-def show_advice(advice: Sequence[lazy.Advice], appraisal: lazy.Appraisal) -> None:
+def _show_advice(advice: Sequence[lazy.Advice], appraisal: lazy.Appraisal) -> None:
     """Print what lifts the chance of success most, as it was tried, each with its command."""
     success = appraisal.headline.success
     if not advice or success is None:
         return
     now = of_hundred(success.value)
-    rows = [(each.words, of_hundred(each.success.value), command_with(each.options)) for each in advice]
+    rows = [(each.words, of_hundred(each.success.value), _command_with(each.options)) for each in advice]
     title = f"What was found to lift the chance of success, now {now} of 100"
     terminal.show([terminal.table(title, ("with", "of 100", "command"), rows)])
 
 
-def command_with(options: Sequence[str]) -> str:
+def _command_with(options: Sequence[str]) -> str:
     """Return the command that runs now with other options in place of those of the same name."""
     words, replaced = sys.argv[1:], {options[0], *(["--nodule"] if options[0] == "--target" else [])}
     kept, skips = [], False
@@ -309,7 +309,7 @@ def command_with(options: Sequence[str]) -> str:
     return shlex.join(["lungaccess", *kept, *options])
 
 
-def limits_table(appraisal: lazy.Appraisal) -> Table:
+def _limits_table(appraisal: lazy.Appraisal) -> Table:
     """Return the limits that the plan comes nearest to; broken ones come first."""
     rows = [
         (each.what, each.found_words, each.bound_words, each.used_words if each.ok else "BROKEN")

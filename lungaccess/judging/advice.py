@@ -56,7 +56,7 @@ class Advice:
         return {"words": self.words, **self.success.to_mapping(), "options": list(self.options)}
 
 
-class Adviser:
+class _Adviser:
     """Tries what could lift the chance of a plan; see `advise`."""
 
     def __init__(
@@ -195,7 +195,7 @@ def advise(
     if not procedure and chance and chance.procedure in procedure_names():
         procedure = load_procedure(chance.procedure)
     began, found = working_s(), []
-    for each in Adviser(plan, lung, errors, procedure, atlas_of, systems).trials():
+    for each in _Adviser(plan, lung, errors, procedure, atlas_of, systems).trials():
         # A chance that is higher by less than this may be so by the luck of the draws.
         if each is not None and each.success.value > success.value + 0.03:
             found.append(each)

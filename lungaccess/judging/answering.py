@@ -103,13 +103,13 @@ def _in_turn(
         )  # fmt: skip
         attempt = first_attempt(plans, system, checker)
         if attempt.plan is not None and attempt.succeeded:
-            choice = choice_in_words(failed, system, ordered)
+            choice = _choice_in_words(failed, system, ordered)
             yield replace(attempt.plan, system_choice=choice)
             yield from (replace(better, system_choice=choice) for better in plans)
             return
         failed.append(attempt)
         left_s = max(left_s - (working_s() - began), 0.0)
-    raise none_reaches(failed)
+    raise _none_reaches(failed)
 
 
 def plan(
@@ -202,10 +202,10 @@ def answer_with_several(
         best = found[0].plan
         attempt = Attempt(system=each, plan=best, report=checker.check(best, each))
         if attempt.succeeded:
-            choice = choice_in_words(failed, each, request.systems)
+            choice = _choice_in_words(failed, each, request.systems)
             return tuple(replace(one, plan=replace(one.plan, system_choice=choice)) for one in found)
         failed.append(attempt)
-    raise none_reaches(failed)
+    raise _none_reaches(failed)
 
 
 def first_attempt(plans: Iterator[Plan], system: System, checker: Checker) -> Attempt:
@@ -217,7 +217,7 @@ def first_attempt(plans: Iterator[Plan], system: System, checker: Checker) -> At
     return Attempt(system=system, plan=found, report=checker.check(found, system))
 
 
-def choice_in_words(failed: Sequence[Attempt], chosen: System, systems: Sequence[System]) -> tuple[str, ...]:
+def _choice_in_words(failed: Sequence[Attempt], chosen: System, systems: Sequence[System]) -> tuple[str, ...]:
     """Say which systems were tried, why each failed, and why one was chosen, in one sentence each."""
     untried = [system.name for system in systems[len(failed) + 1 :]]
     rest = f"; more invasive and not tried: {', '.join(untried)}" if untried else ""
@@ -228,7 +228,7 @@ def choice_in_words(failed: Sequence[Attempt], chosen: System, systems: Sequence
     )
 
 
-def none_reaches(failed: Sequence[Attempt]) -> NoPlan:
+def _none_reaches(failed: Sequence[Attempt]) -> NoPlan:
     """Return the `NoPlan` of several systems that all failed."""
     names = ", ".join(attempt.system.name for attempt in failed)
     return NoPlan(

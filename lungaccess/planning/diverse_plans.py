@@ -99,7 +99,7 @@ def alternatives(
     *_, best = run(limited, atlas=atlas, counterfactuals=counterfactuals, on_progress=on_progress)
     plans = [best]
     for each in _others(request, place_part(request, atlas), count, separation_mm):
-        if len(plans) < count and are_separated(best, each, separation_mm):
+        if len(plans) < count and _are_separated(best, each, separation_mm):
             plans.append(each)
     plans[1:] = [with_simplest_motion(plan, request.lung) for plan in plans[1:]]
     made = [with_window(plan, request.lung) if plan.window is None else plan for plan in plans]
@@ -120,7 +120,7 @@ def _others(request: Request, atlas: Atlas, count: int, separation_mm: float) ->
             yield made if rating is None else rating.stated(made, 1000)
 
 
-def are_separated(one: Plan, other: Plan, separation_mm: float) -> bool:
+def _are_separated(one: Plan, other: Plan, separation_mm: float) -> bool:
     """Tell whether some point of what the costs of either plan are of is so far from the other's."""
     a, b = (each.costed_poses(1.0)[0][:, :3, 3] for each in (one, other))
     away = np.linalg.norm(a[:, None] - b, axis=2)

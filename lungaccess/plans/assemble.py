@@ -74,11 +74,11 @@ def assemble(task: Task, candidate: Candidate, *, iteration: int, timing: Mappin
         seed=task.seed,
         iterations=iteration,
         timing=timing,
-        aim=aim_of_tool(system, path),
+        aim=_aim_of_tool(system, path),
     )
 
 
-def aim_of_tool(system: System, path: ArcPath) -> BreathingAim | None:
+def _aim_of_tool(system: System, path: ArcPath) -> BreathingAim | None:
     """Return where a path ends whose tool is at the target as the aim of a plan; None without a tool."""
     if system.tool is None:
         return None
@@ -96,7 +96,7 @@ def with_devices(task: Task, candidate: Candidate, model: Plan) -> Plan:
     needle = None if task.system.needle is None else needle_part(path)
     exemption = replace(model.exemption, branch=deployment.branch, exit_point_lps=tube.exit.point_lps)
     scope = replace(model.scope, lps_from_scope_tip=frame)
-    aim = aim_of_tool(task.system, path)
+    aim = _aim_of_tool(task.system, path)
     chance = fissure_chance(task.system, task.lung, frame, deployment, path)
     return replace(
         model, scope=scope, tube=tube, needle=needle, exemption=exemption, aim=aim, fissure_chance=chance

@@ -107,7 +107,7 @@ class Picture:
     def _beyond(self, point: int) -> Bool:
         """Tell which rays end in the airway from a point of the tree on."""
         tree, own = self._tree, int(self._tree.branch_of_point[point])
-        found: Bool = np.append(branches_beyond(tree, point), False)[self._branch]
+        found: Bool = np.append(_branches_beyond(tree, point), False)[self._branch]
         here = np.flatnonzero(self._branch == own)
         points = tree.branch_points(own)
         ends = self._eye + self._away_mm[here, None] * self._rays[here]
@@ -150,7 +150,7 @@ class Picture:
         )
 
 
-def branches_beyond(tree: AirwayTree, point: int) -> Bool:
+def _branches_beyond(tree: AirwayTree, point: int) -> Bool:
     """Return which branches `(B,)` go on from a point of the tree, that of the point among them."""
     own, parents = int(tree.branch_of_point[point]), tree.branch_parent.tolist()
     forks = tree.parent_point[tree.branch_start[:-1]].tolist()
@@ -353,7 +353,7 @@ def _first(true: Bool) -> int:
     return int(np.argmax(true)) if true.any() else len(true) - 1
 
 
-def branch_label(tree: AirwayTree, branch: int) -> str:
+def _branch_label(tree: AirwayTree, branch: int) -> str:
     """Return the short name of a branch."""
     if branch == 0:
         return "trachea"
@@ -362,7 +362,7 @@ def branch_label(tree: AirwayTree, branch: int) -> str:
     return tree.bronchi.names[branch] or f"branch {branch}"
 
 
-def branch_name(lung: Lung, branch: int) -> str:
+def _branch_name(lung: Lung, branch: int) -> str:
     """Return what is known of a branch: number and generation, a main bronchus by its side, else its lobe.
 
     A lobe is named only where the bronchus has no name, and all ends at or beyond the branch lie in it.
@@ -376,7 +376,7 @@ def branch_name(lung: Lung, branch: int) -> str:
     if words := tree.bronchi.words(branch):
         return f"{words} ({known})"
     # The last points of the branches without children at or beyond the branch.
-    leaves = tree.leaf_branches[branches_beyond(tree, int(tree.branch_start[branch]))[tree.leaf_branches]]
+    leaves = tree.leaf_branches[_branches_beyond(tree, int(tree.branch_start[branch]))[tree.leaf_branches]]
     lobes = {_lobe(lung, end) for end in tree.points_lps[tree.branch_start[leaves + 1] - 1]}
     return f"{known}, to the {lobes.pop()}" if len(lobes) == 1 and "" not in lobes else known
 
@@ -406,8 +406,8 @@ def _openings(lung: Lung, lps_from_eye: Float, points: list[int]) -> tuple[Openi
         made.append(
             Opening(
                 branch=branch,
-                label=branch_label(lung.tree, branch),
-                name=branch_name(lung, branch),
+                label=_branch_label(lung.tree, branch),
+                name=_branch_name(lung, branch),
                 place_lps=(x, y, z),
                 hour=hole.hour(lps_from_eye),
                 side=side,

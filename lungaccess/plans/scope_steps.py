@@ -88,7 +88,7 @@ class ScopeStep:
             way = "" if twist == "0" else f" {_way(self.to_twist_deg)}"
             said.append(f"{turn} (seen from behind), to {twist}°{way}")
         if self.to_bend_deg != self.from_bend_deg:
-            bends = bend_words(self.from_bend_deg), bend_words(self.to_bend_deg)
+            bends = _bend_words(self.from_bend_deg), _bend_words(self.to_bend_deg)
             said.append("bring the tip from {} to {}".format(*bends))
         return " and evenly with it ".join(said)
 
@@ -122,13 +122,13 @@ def _way(twist_deg: float) -> str:
     return "clockwise" if twist_deg > 0.0 else "counterclockwise"
 
 
-def bend_words(bend_deg: float) -> str:
+def _bend_words(bend_deg: float) -> str:
     """Return a bend in words, such as "20° up"."""
     number = _number(abs(bend_deg))
     return "straight" if number == "0" else f"{number}° {'up' if bend_deg > 0.0 else 'down'}"
 
 
-def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
+def _written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
     """Return the motion of a plan's bronchoscope as steps write it, with as few decimals as its proof takes.
 
     It has the most decimals where not even the motion of the plan is proved.
@@ -147,7 +147,7 @@ def written_motion(plan: Plan, lung: Lung) -> ScopeMotion:
 
 def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
     """Return the motion of a plan's bronchoscope as steps, each from one proved state to the next."""
-    motion = written_motion(plan, lung)
+    motion = _written_motion(plan, lung)
     allowed = prover_of(lung, plan.system.scope).tolerances(motion)
     eyes = lps_from_camera(plan.system, motion.tips)
     places = lung.tree.route(int(lung.tree.branch_start[plan.scope.branches[-1] + 1]) - 1)
@@ -156,7 +156,7 @@ def scope_steps(plan: Plan, lung: Lung) -> tuple[ScopeStep, ...]:
 
 def steps_note(plan: Plan, lung: Lung) -> str:
     """Say what there is to know of the steps wherever they are shown, above all if they are not proved."""
-    proved = prover_of(lung, plan.system.scope).prove(written_motion(plan, lung))
+    proved = prover_of(lung, plan.system.scope).prove(_written_motion(plan, lung))
     said = f"These steps are not proved: {proved}." if isinstance(proved, str) else PROVED
     return f"{said} {DIRECTIONS}"
 
@@ -205,8 +205,8 @@ def handle_factor(plan: Plan) -> float:
 def handle_words(plan: Plan) -> str:
     """Say how the handle is set while the tubes go in, which straighten the section."""
     bend_deg, factor = float(np.degrees(plan.scope.states[-1, 2])), handle_factor(plan)
-    with_tubes, without = (bend_words(round(each, 1)) for each in (bend_deg, bend_deg * factor))
-    if with_tubes == bend_words(0.0):
+    with_tubes, without = (_bend_words(round(each, 1)) for each in (bend_deg, bend_deg * factor))
+    if with_tubes == _bend_words(0.0):
         return "The tip is straight, and tubes in the channel leave it so."
     return (
         f"Tubes in the channel straighten the tip: as they go in, set the handle up to {factor:.2f} times as "

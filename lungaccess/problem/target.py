@@ -44,7 +44,7 @@ class StatedTarget:
     def resolve(self, lung: Organ) -> Target:
         """Return the target in a lung; see `resolve_target`."""
         if self.name:
-            return point_target(lung, named_target(lung, self.name), origin=self.origin)
+            return point_target(lung, _named_target(lung, self.name), origin=self.origin)
         if self.lps_mm is None:
             return nodule_target(lung, self.nodule)
         return point_target(lung, self.lps_mm, origin=self.origin)
@@ -52,7 +52,7 @@ class StatedTarget:
     def centre_lps(self, lung: Organ) -> Float:
         """Return the point `(3,)` LPS mm, wherever it lies, or that of the nodule."""
         if self.name:
-            return named_target(lung, self.name)
+            return _named_target(lung, self.name)
         return nodule_target(lung, self.nodule).lps_mm if self.lps_mm is None else self.lps_mm
 
 
@@ -88,7 +88,7 @@ def stated_target(text: str | None, nodule: int | None) -> StatedTarget:
     return StatedTarget(lps_mm=parse_point(text), nodule=0, origin=f"point {text}")
 
 
-def named_target(lung: Organ, name: str) -> Float:
+def _named_target(lung: Organ, name: str) -> Float:
     """Return the point `(3,)` LPS mm of the patient's target of a name or number; TargetError without one."""
     names = [known.lower() for known in lung.target_names]
     if name.lower() in names:

@@ -50,11 +50,11 @@ def export_models(plan: Plan, lung: Lung, folder: str | Path) -> tuple[str, ...]
         solid.visual = trimesh.visual.TextureVisuals(material=material)
         scene.add_geometry(solid, node_name=name, geom_name=name, transform=GLTF_FROM_LPS)
     _write(target / SCENE_FILE, scene.export(file_type="glb"))
-    write_json(target / CAMERA_FILE, camera_frames(plan))
+    write_json(target / CAMERA_FILE, _camera_frames(plan))
     return (*(f"{name}.stl" for name in surfaces), SCENE_FILE, CAMERA_FILE)
 
 
-def camera_frames(plan: Plan) -> dict[str, object]:
+def _camera_frames(plan: Plan) -> dict[str, object]:
     """Return the eye of the bronchoscope for each picture of a film of a plan, as plain JSON values."""
     motion = plan_trajectory(plan, step_s=1.0 / FRAMES_PER_S)
     eyes = lps_from_camera(plan.system, motion.lps_from_scope_tip)

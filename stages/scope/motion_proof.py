@@ -66,7 +66,7 @@ class MotionProver:
         wall the bound is about 0.1 mm too low at most.  Longer parts of changes in place, `turn_mm`, and
         longer steps along the body, `step_mm`, prove less.
         """
-        wrong = broken_limit(self._scope, motion)
+        wrong = _broken_limit(self._scope, motion)
         if wrong:
             return wrong
         device, entry = self._device, frame_columns(motion.lps_from_entry)
@@ -122,7 +122,7 @@ class MotionProver:
         return TipRow(motion=motion, shifts_mm=shifts, tips=tips, proved=proved | (shifts == 0.0))
 
 
-def broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:
+def _broken_limit(scope: Bronchoscope, motion: ScopeMotion) -> str:
     """Say which limit of the device a motion breaks, "" if none."""
     states = motion.states
     if not np.isfinite(states).all() or not np.isfinite(motion.lps_from_entry).all():

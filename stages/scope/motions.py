@@ -255,7 +255,7 @@ def find_motions(
     states = Growth(walls, tree, tried, passages.passable, device).grow()
     least, most = tip_bends_rad or scope.bends_rad
     device = device._replace(least_bend=least, most_bend=most)
-    tips, tree_point, ahead = find_tips(
+    tips, tree_point, ahead = _find_tips(
         walls, tree, passages.exits_ahead, states, device, max_curvature_per_mm, spacing_mm
     )
     kept, number = states.only(tips[:, turning.SOURCE].astype(np.int64))
@@ -284,7 +284,7 @@ ROUNDING = 1e-9
 """Tips keep the limits of their region by this much, so that who computes them otherwise agrees."""
 
 
-def find_tips(
+def _find_tips(
     walls: Walls,
     tree: AirwayTree,
     wanted: Bool,

@@ -81,7 +81,7 @@ def spread_of_tip(
     shaft: RestingShaft, motion: ScopeMotion, contact: WallContact, lps_from_pose: Float
 ) -> TipSpread:
     """Return the distribution of the resting tip of a motion about a pose, such as the planned one."""
-    nominal, other = two_starts(shaft, motion)
+    nominal, other = _two_starts(shaft, motion)
     off: list[list[Float]] = []
 
     def at_rest(chosen: Circumstances) -> RestingShape:
@@ -121,7 +121,7 @@ def spread_of_tip(
     )
 
 
-def two_starts(shaft: RestingShaft, motion: ScopeMotion) -> tuple[RestingShape, RestingShape | None]:
+def _two_starts(shaft: RestingShaft, motion: ScopeMotion) -> tuple[RestingShape, RestingShape | None]:
     """Return the resting shape from that as laid, and the one from a relaxed section if it differs."""
     states = motion.states.copy()
     states[-1, BEND] = 0.0

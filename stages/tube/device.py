@@ -45,7 +45,7 @@ class Bend(NamedTuple):
     direction_rad: float
 
 
-def tube_parts(
+def _tube_parts(
     length_mm: float,
     bends: Sequence[Bend],
     slots: Sequence[SlottedSegment],
@@ -150,7 +150,7 @@ class Tube:
     def parts(self) -> TubeParts:
         """The tube cut where its precurvature or its slots change."""
         slots, stiffness = self.slotted_segments, self.bending_stiffness_n_mm2
-        return tube_parts(self.length_mm, self.bends, slots, stiffness, self.radius_mm)
+        return _tube_parts(self.length_mm, self.bends, slots, stiffness, self.radius_mm)
 
     def most_bent_per_mm(self, max_strain: float, passing_mm: float) -> float:
         """Return how bent a channel may be that the first `passing_mm` of the tube pass, 1/mm.

@@ -93,8 +93,8 @@ def examine() -> dict[str, Any]:
         "free_memory_bytes": _free_memory(),
         "libraries": _libraries(),
         "kernels": kernels,
-        "cache": look_at(default_cache()),
-        "data": None if data is None else look_at(Path(data)),
+        "cache": _look_at(default_cache()),
+        "data": None if data is None else _look_at(Path(data)),
     }
     warm = "warm" if kernels["warm"] == kernels["modules"] else "partly warm"
     state = warm if kernels["warm"] else "cold"
@@ -175,11 +175,11 @@ def kernel_cache() -> dict[str, Any]:
         "warm": len({file.parent.name for file in files}.intersection(names)),
         "size_bytes": sum(file.stat().st_size for file in files),
         "digest": kernel_digest(),
-        "writable": look_at(folders.kernels_folder())["writable"],
+        "writable": _look_at(folders.kernels_folder())["writable"],
     }
 
 
-def look_at(path: Path) -> dict[str, Any]:
+def _look_at(path: Path) -> dict[str, Any]:
     """Return what a folder holds; a folder that can still be made counts as writable."""
     files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else []
     nearest = next((each for each in (path, *path.parents) if each.exists()), path)

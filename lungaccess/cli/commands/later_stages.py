@@ -109,7 +109,7 @@ def _decided(
     if kept is not None:
         record.save(kept)
     terminal.tell(decision.record())
-    terminal.show(decision_tables(decision))
+    terminal.show(_decision_tables(decision))
     return ExitCode.of(decision.goes_on)
 
 
@@ -164,7 +164,7 @@ def tube_rows(tube: lazy.TubeDeployment | None) -> list[tuple[str, str]]:
     ]
 
 
-def decision_tables(decision: lazy.Decision) -> list[Table]:
+def _decision_tables(decision: lazy.Decision) -> list[Table]:
     """Return what a policy says is to be done next."""
     rows = [("estimated chance of success so", f"{of_hundred(decision.chance)} of 100")]
     if decision.again:

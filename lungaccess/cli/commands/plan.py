@@ -41,10 +41,10 @@ def demo(
     search = options.SearchOptions(budget=budget, seed=seed)
     claim_folder(out, plan_search.RESULTS, force=force)
     with progress("making a synthetic patient") as shown:
-        lung = demo_lung(seed, shown.step)
+        lung = _demo_lung(seed, shown.step)
     target, systems = lazy.stated_target(None, 1), options.SystemOptions().candidates()
     terminal.show(anatomy_tables(lung)[1:3])
-    guide = what_to_look_at(out)
+    guide = _what_to_look_at(out)
     job = plan_search.PlanJob(asked=search.asked(systems), target=target, out=out, guide=guide)
     failure: NoPlan | None = None
     for number in range(1, len(lung.targets_lps) + 1):
@@ -60,7 +60,7 @@ def demo(
     )
 
 
-def demo_lung(seed: int, progress: Callable[[str], None]) -> lazy.Lung:
+def _demo_lung(seed: int, progress: Callable[[str], None]) -> lazy.Lung:
     """Make the synthetic patient of the demonstration; its prepared anatomy is cached.
 
     An adult, because the presets are: a child's airways hold no bronchoscope of 4 mm.
@@ -70,7 +70,7 @@ def demo_lung(seed: int, progress: Callable[[str], None]) -> lazy.Lung:
     return lazy.open_lung(dict(images.sources), lambda: images, progress=progress)
 
 
-def what_to_look_at(out: Path) -> Panel:
+def _what_to_look_at(out: Path) -> Panel:
     """Return a guide to the pictures of a plan."""
     lines = (
         f"{out / 'overview.png'}: the blue scope stays in the airway, the orange tube leaves through its "
@@ -124,11 +124,11 @@ def plan(
         # What would help is explained for the target of the masks, where nothing moves.
         if explain_time == 0.0 or asked.request(lung, stated.resolve(lung)).is_for_window:
             raise
-        explain_and_report(lung, job, failure, search.cost, explain_time)
+        _explain_and_report(lung, job, failure, search.cost, explain_time)
         return ExitCode.NEGATIVE
 
 
-def explain_and_report(
+def _explain_and_report(
     lung: lazy.Lung, job: plan_search.PlanJob, failure: NoPlan, cost: str, time_s: float | None
 ) -> None:
     """Explain a `NoPlan`, write and show what was learned.
@@ -137,7 +137,7 @@ def explain_and_report(
     """
     explanation = _explained(lung, job, failure, cost, time_s)
     written = lazy.save_explanation(explanation, job.out)
-    show_explanation(explanation)
+    _show_explanation(explanation)
     if job.pictures:
         written = (*written, *_drawn(lung, job, explanation))
     record = lazy.explanation_record(explanation)
@@ -182,7 +182,7 @@ def _drawn(lung: lazy.Lung, job: plan_search.PlanJob, explanation: lazy.Explanat
     return PICTURE, PAGE
 
 
-def show_explanation(explanation: lazy.Explanation) -> None:
+def _show_explanation(explanation: lazy.Explanation) -> None:
     """Print the headline, then what was learned, the most useful first, then the counted reasons."""
     terminal.console.print(
         Panel(explanation.headline, title="no plan", title_align="left", border_style="yellow")

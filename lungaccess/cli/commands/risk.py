@@ -63,9 +63,9 @@ def risk(
                 radius_mm=radius,
                 processes=processes,
             )
-        terminal.tell(procedure_record(found) | resting_record(rested))
+        terminal.tell(_procedure_record(found) | _resting_record(rested))
         terminal.say(lazy.Headline.of(None, found).chance_text)
-        terminal.show([*procedure_tables(found), _resting_table(rested)])
+        terminal.show([*_procedure_tables(found), _resting_table(rested)])
         return ExitCode.OK
     samples = samples or lazy.DEFAULT_SAMPLES
     with progress("deviating the plan"):
@@ -74,7 +74,7 @@ def risk(
         kept = lazy.find_tolerances(
             stored, lung, model=model, probability=probability, seed=seed, radius_mm=radius
         )
-    terminal.tell(record(report, kept) | resting_record(rested))
+    terminal.tell(record(report, kept) | _resting_record(rested))
     terminal.say(lazy.Headline.of(None, report).chance_text)
     planned = stored.chance
     if planned is not None and planned.procedure != followed.name:
@@ -111,7 +111,7 @@ def record(report: lazy.RiskReport, kept: tuple[lazy.Tolerance, ...]) -> dict[st
     }
 
 
-def resting_record(rows: Sequence[lazy.RestingRow]) -> dict[str, object]:
+def _resting_record(rows: Sequence[lazy.RestingRow]) -> dict[str, object]:
     """Return what the shaft at rest on the wall does to a plan, as plain values."""
     return {"resting_scope": [asdict(each) for each in rows]}
 
@@ -126,8 +126,8 @@ def _resting_table(rows: Sequence[lazy.RestingRow]) -> Table:
 
 def _outcome_table(report: lazy.RiskReport) -> Table:
     rows = [
-        share_row("succeeds", report.succeeds),
-        share_row(report.tissue or f"ends within {report.radius_mm:.2f} mm", report.reaches),
+        _share_row("succeeds", report.succeeds),
+        _share_row(report.tissue or f"ends within {report.radius_mm:.2f} mm", report.reaches),
     ]
     for name, share in report.touches.items():
         words = name if name.startswith("stays") else f"touches {name}"
@@ -137,7 +137,7 @@ def _outcome_table(report: lazy.RiskReport) -> Table:
             said = f"{range_of_hundred(rare.interval)}, as {rare.effective_samples:.0f} events"
             rows.append((f"{words} (weighted)", of_hundred(rare.value, up=True), said))
         else:
-            rows.append(share_row(words, share, fails=True))
+            rows.append(_share_row(words, share, fails=True))
     rows += [(f"{percent(share)} end within", f"{miss:.2f}", "mm") for share, miss in report.miss_mm.items()]
     title = f"{report.samples} deviated plans, errors of '{report.model.label}'; {_goal_words(report)}"
     return terminal.table(title, ("", "%", "95 % interval"), rows)
@@ -182,7 +182,7 @@ def _tolerance_table(kept: tuple[lazy.Tolerance, ...]) -> Table:
     return terminal.table("Tolerance", headings, rows)
 
 
-def share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
+def _share_row(name: str, share: Share, *, fails: bool = False) -> terminal.Row:
     """Return name, per cent and interval of a share, which is rounded up where it fails."""
     return name, of_hundred(share.value, up=fails), range_of_hundred(share.interval)
 
@@ -200,7 +200,7 @@ def _estimate_record(report: lazy.RiskReport | lazy.ProcedureReport) -> dict[str
     }
 
 
-def procedure_record(report: lazy.ProcedureReport) -> dict[str, object]:
+def _procedure_record(report: lazy.ProcedureReport) -> dict[str, object]:
     """Return a report as plain values."""
     return _estimate_record(report) | {
         "procedure": lazy.to_mapping(report.procedure),
@@ -218,10 +218,10 @@ def procedure_record(report: lazy.ProcedureReport) -> dict[str, object]:
     }
 
 
-def procedure_tables(report: lazy.ProcedureReport) -> list[Table]:
+def _procedure_tables(report: lazy.ProcedureReport) -> list[Table]:
     """Return how procedures ended, and what each stage corrected."""
-    rows = [share_row("success", report.succeeds)]
-    rows += [share_row(name, share, fails=True) for name, share in report.failures]
+    rows = [_share_row("success", report.succeeds)]
+    rows += [_share_row(name, share, fails=True) for name, share in report.failures]
     rows += [
         (f"{percent(share)} of the inserted end within", f"{miss:.2f}", "mm")
         for share, miss in report.miss_mm.items()

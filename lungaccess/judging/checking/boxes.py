@@ -194,7 +194,7 @@ class Tiles:
         core = body[1:-1, 1:-1, 1:-1]
         if not core.any():
             return
-        index = np.argwhere(on_surface(body))
+        index = np.argwhere(_on_surface(body))
         names = core[tuple(index.T)]
         for name in np.unique(names):
             voxels = index[names == name] + begin
@@ -214,7 +214,7 @@ def _bodies(key: int, labels: Labels) -> Labels:
     return np.where(mask, branch_of(labels) + 2 if key == structures.AIRWAY else mask, 0).astype(np.uint16)
 
 
-def on_surface(body: Labels) -> Bool:
+def _on_surface(body: Labels) -> Bool:
     """Tell which inner voxels have a face neighbour of another body, and are not 0 themselves.
 
     The voxel nearest to a point outside of a body is one of these.

@@ -56,9 +56,9 @@ class Checker:
                 check_tubes_at_target(plan, self._environment, tube_tip, found)
             else:
                 check_needle(plan, needle, device, self._environment, tube_tip, found)
-            check_fissure_chance(plan, self._environment.lung, found)
+            _check_fissure_chance(plan, self._environment.lung, found)
             check_window(plan, self._environment, found)
-            check_functions(plan, self._environment.lung, found)
+            _check_functions(plan, self._environment.lung, found)
         return found.report()
 
     def completed(self, motions: Motions, system: System, target_lps: ArrayLike, *, method: str) -> Plan:
@@ -93,7 +93,7 @@ def check(
     return Checker(lung).check(plan, system, target_lps=target_lps)
 
 
-def check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
+def _check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
     """Recompute the chance of crossing a fissure along the axes, and compare it with what is allowed."""
     name, stated, most = "fissure.chance", plan.fissure_chance, plan.system.max_fissure_chance
     if lung.fissure_band is None:
@@ -117,7 +117,7 @@ def check_fissure_chance(plan: Plan, lung: "Lung", found: Findings) -> None:
         found.measured(name, chance, "", "chance that tubes or needle cross a fissure")
 
 
-def check_functions(plan: Plan, lung: "Lung", found: Findings) -> None:
+def _check_functions(plan: Plan, lung: "Lung", found: Findings) -> None:
     """Compute every function that the plan states a value of, where it is known here."""
     known = goals()
     for name, stated in plan.goals.items():

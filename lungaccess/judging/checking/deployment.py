@@ -42,7 +42,7 @@ STEP_MM = 0.5
 """Spacing of the places of channel and tube that are looked at; what is between two is counted with both."""
 
 
-def check_channel(plan: Plan, found: Findings) -> None:
+def _check_channel(plan: Plan, found: Findings) -> None:
     """Record strain of tubes and needle all along the channel, and the bend that the handle must set."""
     scope, device, tubes = plan.scope, plan.system.scope, plan.system.tubes
     motion = motion_of(scope.lps_from_entry, scope.states, device.bending_length_mm)
@@ -61,7 +61,7 @@ def check_channel(plan: Plan, found: Findings) -> None:
     needle = plan.system.needle
     if needle is not None:
         # Tubes that share a bend are bent by no more than the most bent of them is at rest.
-        at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in bent_at_rest(tube))
+        at_rest = max(curvature for tube in tubes.nested for _begin, _end, curvature in _bent_at_rest(tube))
         strain = 0.5 * needle.diameter_mm * _largest_factor(plan.system) * max(tightest, at_rest)
         detail = "largest strain of the needle on its way through channel and tubes"
         found.at_most("needle.strain", strain, needle.max_strain, "", detail, 1e-9)
@@ -75,17 +75,17 @@ def _strains(tube: Tube, behind_mm: Float, bent: Float, inserted_mm: float) -> I
         passed = bent[behind_mm >= at - inserted_mm - STEP_MM]
         most = float(passed.max(initial=0.0))
         for end in (max(at - STEP_MM, 0.0), at):
-            rest = max(k for begin, stop, k in bent_at_rest(tube) if begin <= end <= stop)
-            yield 0.5 * tube.outer_diameter_mm * slots_at(tube.slotted_segments, end)[1] * (most + rest)
+            rest = max(k for begin, stop, k in _bent_at_rest(tube) if begin <= end <= stop)
+            yield 0.5 * tube.outer_diameter_mm * _slots_at(tube.slotted_segments, end)[1] * (most + rest)
 
 
-def bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
+def _bent_at_rest(tube: Tube) -> list[tuple[float, float, float]]:
     """Return the parts of a tube: begin and end in mm from its tip, and precurvature in 1/mm."""
     parts = [(begin, end, curvature) for begin, end, curvature, _direction in _pieces(tube)]
     return [*parts, (parts[-1][1], np.inf, 0.0)]
 
 
-def slots_at(segments: Sequence[SlottedSegment], from_tip_mm: float) -> tuple[float, float]:
+def _slots_at(segments: Sequence[SlottedSegment], from_tip_mm: float) -> tuple[float, float]:
     """Return how stiff and how strained a shaft is at a place, as shares of a plain one's."""
     for segment in segments:
         if segment.from_tip_mm <= from_tip_mm <= segment.from_tip_mm + segment.length_mm:
@@ -125,7 +125,7 @@ def _stiffest_n_mm2(shaft: Tube | Needle, diameter_mm: float, from_tip_mm: Float
     """Return the greatest bending stiffness of a shaft at places of it."""
     plain = 1e3 * shaft.youngs_modulus_gpa * np.pi / 64.0
     plain *= diameter_mm**4 - shaft.inner_diameter_mm**4
-    return plain * max(slots_at(shaft.slotted_segments, float(at))[0] for at in from_tip_mm)
+    return plain * max(_slots_at(shaft.slotted_segments, float(at))[0] for at in from_tip_mm)
 
 
 WALL_ZONE_MM = 1.0
@@ -152,8 +152,8 @@ def check_deployment(plan: Plan, environment: Environment, found: Findings) -> F
     tip = shapes.tube_tip(plan, curve)
     check_same_pose("tube.tip", tube.lps_from_tip, tip, found)
     _check_lengths(plan, found)
-    check_channel(plan, found)
-    beside_mm = check_shape(plan, curve, found)
+    _check_channel(plan, found)
+    beside_mm = _check_shape(plan, curve, found)
     if beside_mm is None:
         return None
     way_out = check_exit(plan, lung, curve, found)
@@ -265,7 +265,7 @@ SHAPE_TOLERANCE_MM = 1e-3
 """Two integrations of one equilibrium differ by far less; so much more than stated may the arcs be off."""
 
 
-def check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
+def _check_shape(plan: Plan, curve: Curve, found: Findings) -> float | None:
     """Record everything about the shape of the tubes; None if they snap.
 
     Returns:
@@ -397,7 +397,7 @@ def _rest(tube: Tube, from_tip_mm: float, angle_rad: float) -> Float:
 
 def _stiffness(tube: Tube, from_tip_mm: float) -> float:
     """Return the bending stiffness of a tube at a place, up to a factor that all tubes share."""
-    factor = slots_at(tube.slotted_segments, from_tip_mm)[0]
+    factor = _slots_at(tube.slotted_segments, from_tip_mm)[0]
     return factor * tube.youngs_modulus_gpa * (tube.outer_diameter_mm**4 - tube.inner_diameter_mm**4)
 
 

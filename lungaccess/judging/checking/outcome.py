@@ -71,7 +71,7 @@ def recomputed_costs(
 ) -> dict[str, Recomputed]:
     """Return every cost by its name, of a re-integrated curve; those of the map of another if given."""
     along = inverse_clearance(plan, environment, curve)
-    mapped, summed = cost_map_integral_and_sum(environment.lung, mapped_curve or curve)
+    mapped, summed = _cost_map_integral_and_sum(environment.lung, mapped_curve or curve)
     crossed = tissue(plan, environment, curve)
     return {
         "inverse_clearance": Recomputed(along, COST_TOLERANCE * along, ""),
@@ -126,7 +126,7 @@ def check_costs(
     named = set(costs) - LATER_COSTS <= set(stated) <= {*costs, plan.objective}
     if not found.true("costs.names", named, ", ".join(stated)):
         return
-    weights = objective_weights(plan.objective)
+    weights = _objective_weights(plan.objective)
     known = plan.objective in stated and weights is not None and set(weights) <= set(costs) & set(stated)
     if (
         found.true("costs.objective", known, plan.objective)
@@ -143,7 +143,7 @@ def check_costs(
             found.agrees(f"costs.{name}", stated[name], value, largest, unit)
 
 
-def objective_weights(objective: str) -> dict[str, float] | None:
+def _objective_weights(objective: str) -> dict[str, float] | None:
     """Return the weights of an objective by the names of costs; None if its text is not one.
 
     The text is the name of a cost, or a sum such as "cost_map=0.5,length_mm=1".
@@ -198,12 +198,12 @@ def tissue(plan: Plan, environment: Environment, curve: Curve) -> float:
             begin_mm = end_mm
     total = 0.0
     for part, width_mm in parts:
-        mapped, _summed = cost_map_integral_and_sum(environment.lung, part)
+        mapped, _summed = _cost_map_integral_and_sum(environment.lung, part)
         total += width_mm * (inverse_clearance(plan, environment, part) + mapped)
     return total
 
 
-def cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:
+def _cost_map_integral_and_sum(lung: Lung, curve: Curve) -> tuple[float, float]:
     """Return the line integral of the cost map in mm, and its sum over the set of voxels crossed.
 
     The chords of the curve, shorter than a voxel, are cut at the faces of voxels.  Without a map both are

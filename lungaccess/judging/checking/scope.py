@@ -330,21 +330,21 @@ def least_gap_mm(motion: Motion, boxes: Boxes, needed_mm: float, stated_mm: floa
 
     It is below `needed_mm` if any is, and below `stated_mm` if any is; else there may be smaller ones.
     """
-    cells, least = first_cells(motion), np.inf
+    cells, least = _first_cells(motion), np.inf
     while len(cells.state):
         gaps = boxes.distance_mm(places(motion, cells))
         least = min(least, float(gaps.min()))
         kept = [limit for limit in (needed_mm, stated_mm) if limit <= least]
         if not kept:
             break
-        arc, swept = cells.half_mm, swept_mm(motion, cells)
+        arc, swept = cells.half_mm, _swept_mm(motion, cells)
         # A cell whose places differ by less is not cut further.
         open_ = (gaps - arc - swept < max(kept)) & (arc + swept > 1e-3)
         cells = cells.pick(open_).halves(swept[open_] > arc[open_])
     return least
 
 
-def first_cells(motion: Motion) -> Cells:
+def _first_cells(motion: Motion) -> Cells:
     """Return cells that cover all places of the section: it slides, twists and bends, and stays at the end.
 
     The shaft lies on what the section has slid along.
@@ -385,7 +385,7 @@ def places(motion: Motion, cells: Cells) -> Float:
     return motion.points(cells.state, cells.along_mm, bends)
 
 
-def swept_mm(motion: Motion, cells: Cells) -> Float:
+def _swept_mm(motion: Motion, cells: Cells) -> Float:
     """Return how far `(C,)` a place of a cell moves at most from the middle of its time, mm.
 
     A curvature that changes by d turns the section at the arc length s by no more than d s, and so moves it

@@ -58,7 +58,7 @@ def check_needle(
     turned, angle = turning(curve)
     found.agrees("needle.turn", needle.accumulated_turn_rad, turned, TURN_TOLERANCE_RAD, "rad")
     found.agrees("needle.angle", needle.max_angle_from_start_rad, angle, TURN_TOLERANCE_RAD, "rad")
-    if not check_limits(needle.arcs, device, curve, found):
+    if not _check_limits(needle.arcs, device, curve, found):
         return
     found.agrees("needle.end", needle.end_lps, curve.points[-1], POSITION_TOLERANCE_MM, "mm")
     check_target(plan, lung, curve.points[-1], found)
@@ -79,7 +79,7 @@ def turning(curve: Curve) -> tuple[float, float]:
     return turned, float(angle_between(curve.tangents, curve.tangents[0]).max())
 
 
-def check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: Findings) -> bool:
+def _check_limits(pieces: Sequence[Piece], device: Needle, curve: Curve, found: Findings) -> bool:
     """Record whether arcs keep the limits of a needle; tell whether it is as short as the device's."""
     curvature = [piece.curvature_per_mm for piece in pieces]
     bound = device.max_curvature_per_mm
@@ -195,7 +195,7 @@ def check_needle_alone(
         ]
         exempt_mm = needle.exit_exemption_mm if branches else 0.0
         curve = integrate(lps_from_start, cut_at(cut_at(pieces, exempt_mm), WALL_ZONE_MM))
-        if check_limits(pieces, needle, curve, found):
+        if _check_limits(pieces, needle, curve, found):
             miss = float(np.linalg.norm(curve.end[:3, 3] - target_lps))
             found.at_most(
                 "target.reached", miss, POSITION_TOLERANCE_MM, "mm", "end of the needle to the target"

@@ -76,7 +76,7 @@ class Reaching:
         return np.array(self.path.frames()[-1][:3, 3])
 
 
-def drawn_lung(rng: scenes.Random) -> Lung:
+def _drawn_lung(rng: scenes.Random) -> Lung:
     """Return a box of 20 mm with an airway that ends in tissue, and vessels around its end."""
     labels, grid = scenes.empty_labels((-9.0, -9.0, -20.0), (9.0, 9.0, 3.0), 1.0)
     for _ in range(8):
@@ -87,7 +87,7 @@ def drawn_lung(rng: scenes.Random) -> Lung:
     return scenes.lung_of(labels, grid, scenes.line_tree(*ends, 2.2))
 
 
-def drawn_tubes(rng: scenes.Random, environment: TubeEnvironment) -> tuple[Float, Float, int, Float, Float]:
+def _drawn_tubes(rng: scenes.Random, environment: TubeEnvironment) -> tuple[Float, Float, int, Float, Float]:
     """Return values and base of a deployment, why it is refused, trace and tip; see `Reaching`."""
     inner = rng.uniform(4.0, 9.9)
     place = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(1.0, 3.0)])
@@ -108,9 +108,9 @@ def drawn_tubes(rng: scenes.Random, environment: TubeEnvironment) -> tuple[Float
 
 def tubes(rng: scenes.Random) -> scenes.Case:
     """Draw deployments; samples of an accepted one, beyond the wall, are clear of all but its branch."""
-    lung = drawn_lung(rng)
+    lung = _drawn_lung(rng)
     environment = tube_environment(lung, with_fissures=False)
-    drawn = [drawn_tubes(rng, environment) for _ in range(12)]
+    drawn = [_drawn_tubes(rng, environment) for _ in range(12)]
 
     def contradiction() -> str:
         for values, base, reason, trace, tip in drawn:
@@ -147,13 +147,13 @@ def centreline(base: Float, forward: Float, normal: Float, outer: float, inner: 
     return np.stack([np.interp(at, fine, points[:, n]) for n in range(3)], axis=1)
 
 
-def drawn_reaching(rng: scenes.Random) -> Reaching:
+def _drawn_reaching(rng: scenes.Random) -> Reaching:
     """Draw tubes until some are accepted and have a clear arc of the needle ahead."""
-    lung = drawn_lung(rng)
+    lung = _drawn_lung(rng)
     environment = tube_environment(lung, with_fissures=False)
     needle = environment_of_labels(lung.labels, lung.grid, NEEDLE, required_clearance_mm=REQUIRED_MM)
     while True:
-        values, base, reason, _trace, tip = drawn_tubes(rng, environment)
+        values, base, reason, _trace, tip = _drawn_tubes(rng, environment)
         if reason != kernels.ACCEPTED:
             continue
         arc = (
@@ -183,7 +183,7 @@ def greatest_insertions() -> Float:
 
 def not_reached(rng: scenes.Random) -> scenes.Case:
     """Draw a deployment that reaches a target; no box that holds it is ruled out, and far ones are."""
-    case = drawn_reaching(rng)
+    case = _drawn_reaching(rng)
     environment, boxes = _proof_environment(case), []
     for scale in (0.01, 0.03, 0.1, 0.2, 0.3, 0.5):
         halves = scale * HALVES * rng.uniform(0.3, 1.0, 8)
@@ -239,7 +239,7 @@ def _proof_environment(case: Reaching) -> ProofEnvironment:
 
 def cost_bound(rng: scenes.Random) -> scenes.Case:
     """Draw a deployment and a path to a target; no bound of a box that holds it is above the path's cost."""
-    case, bounds = drawn_reaching(rng), []
+    case, bounds = _drawn_reaching(rng), []
     cost = path_cost(case)
     tips, limits = case.base[None], case.needle.limits
     environment = bound_environment(case.tubes, limits, WEIGHTS, case.target, tips, 3.0 * cost)

@@ -40,7 +40,7 @@ def windows(rng: scenes.Random) -> scenes.Case:
     ahead = np.array([*rng.uniform(-0.15, 0.15, 2), -1.0])
     points = np.array([0.0, 0.0, -1.0]) + ARC_MM[:, None] * ahead / np.linalg.norm(ahead)
     for _ in range(5):
-        place = points[int(rng.integers(16, 31))] + np.array([*rng.uniform(1.4, 2.2) * unit2(rng), 0.0])
+        place = points[int(rng.integers(16, 31))] + np.array([*rng.uniform(1.4, 2.2) * _unit2(rng), 0.0])
         labels[scenes.near_segment(grid, place, place + scenes.unit(rng), 0.5)] = VESSEL
     scenes.draw_airway(labels, grid, (0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 2.0)
     lung, motion = (
@@ -73,7 +73,7 @@ def windows(rng: scenes.Random) -> scenes.Case:
     return scenes.Case(answers=leaves.ravel(), contradiction=contradiction)
 
 
-def unit2(rng: scenes.Random) -> Float:
+def _unit2(rng: scenes.Random) -> Float:
     """Return a random direction `(2,)`."""
     around = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(around), np.sin(around)])

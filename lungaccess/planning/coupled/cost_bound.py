@@ -63,7 +63,7 @@ class CostBound:
         self._task = task
         self._tubes = tube_constants(system.tubes, system.margins)
         self._tips = atlas.motions.tips
-        self.queues: list[BoxQueue] = []
+        self.queues: list[_BoxQueue] = []
         """Once it has begun."""
         self._workers = ThreadPoolExecutor(QUEUES)
         self._running: list[Future[None]] = []
@@ -104,7 +104,7 @@ class CostBound:
             for n in range(QUEUES):
                 tips = np.ascontiguousarray(self._tips[n::QUEUES])
                 about = (environment, self._tubes, insertions, tips, (x, y, z))
-                self.queues.append(BoxQueue(about, MOST_BOXES // QUEUES))
+                self.queues.append(_BoxQueue(about, MOST_BOXES // QUEUES))
         self._running = [self._workers.submit(each.go_on, cost, boxes // QUEUES) for each in self.queues]
 
     def finish(self) -> None:
@@ -126,7 +126,7 @@ class CostBound:
         ]
 
 
-class BoxQueue:
+class _BoxQueue:
     """The boxes of some scope tips, the lowest first.
 
     Args:

@@ -32,7 +32,7 @@ LIMITS = {
 }
 
 
-def structure_in_words(label: int) -> str:
+def _structure_in_words(label: int) -> str:
     """Return the structure that a voxel label stands for, with the branch of an airway."""
     if label & AIRWAY:
         branch = (label >> BRANCH_SHIFT) - 1
@@ -52,7 +52,7 @@ def reason_in_words(found: stage.Obstruction) -> str:
         return f"target out of reach of this radius: needs R <= {radius_mm:.1f} mm{_needle_with(radius_mm)}"
     what = {"start": "start blocked", "target": "target blocked"}.get(found.place, "path blocked")
     return (
-        f"{what} by {structure_in_words(found.label)}: "
+        f"{what} by {_structure_in_words(found.label)}: "
         f"{found.distance_mm:.2f} mm away, needs {found.needed_mm:.2f} mm"
     )
 
@@ -92,7 +92,7 @@ def _place(found: stage.Obstruction) -> str:
     return f"{along}at {point_in_words(found.point_lps)}"
 
 
-def obstruction_record(found: stage.Obstruction, proved: bool, lobe: str = "") -> dict[str, Any]:
+def _obstruction_record(found: stage.Obstruction, proved: bool, lobe: str = "") -> dict[str, Any]:
     """Return plain JSON values: points in both frames, mm, angles in rad."""
     x, y, z = (float(v) for v in found.point_lps)
     branch = (found.label >> BRANCH_SHIFT) - 1
@@ -100,7 +100,7 @@ def obstruction_record(found: stage.Obstruction, proved: bool, lobe: str = "") -
         "what": found.place,
         "reason": reason_in_words(found),
         "proved": proved,
-        "structure": structure_in_words(found.label) if found.label else None,
+        "structure": _structure_in_words(found.label) if found.label else None,
         "branch": branch if found.label & AIRWAY and branch >= 0 else None,
         "lobe": lobe or None,
         "point_lps_mm": [x, y, z],
@@ -302,7 +302,7 @@ class NeedleAnswer(PathSearch, NeedleQuestion):
             "path": None,
         }
         if self.obstruction is not None:
-            record["blocked"] = obstruction_record(self.obstruction, self.proved, self.lobe)
+            record["blocked"] = _obstruction_record(self.obstruction, self.proved, self.lobe)
         if path is not None:
             record["path"] = {
                 "first_path_s": self.first_path_s,

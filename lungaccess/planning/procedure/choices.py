@@ -150,7 +150,7 @@ def scope_frames(starts: Float) -> Float:
     return frames
 
 
-def residual_rows(left: Sizes) -> Float:
+def _residual_rows(left: Sizes) -> Float:
     """Return what is left of the errors of scope and tubes in some draws, as kernels take it."""
     # Seed of these draws, which have nothing to do with those of a simulated procedure.
     rng = np.random.default_rng(1)
@@ -176,7 +176,7 @@ def planned_choice(plan: Plan, left: Sizes) -> Choices:
         scope_from_tip=np.asarray(np.linalg.inv(frame) @ np.asarray(tube.lps_from_tip))[None],
         rotations=np.array([tube.rotation_rad]), exits=np.array([tube.exit.arc_length_mm]),
         lengths=np.array([tube.inner_insertion_mm]), tubes=tubes, shapes=shapes, n_arcs=counts,
-        beside=np.array([tube.clearance_loss_mm]), errors=residual_rows(left),
+        beside=np.array([tube.clearance_loss_mm]), errors=_residual_rows(left),
     )  # fmt: skip
 
 

@@ -41,7 +41,7 @@ class ProcedureRecord:
         """Write the record as JSON; FileError if that is impossible."""
         policy = self.policy
         content = {
-            "plan_sha256": plan_digest(policy.plan), "errors": to_mapping(policy.errors),
+            "plan_sha256": _plan_digest(policy.plan), "errors": to_mapping(policy.errors),
             "procedure": to_mapping(policy.procedure), "radius_mm": policy.assessor.radius_mm,
             "steps": self.steps,
         }  # fmt: skip
@@ -67,7 +67,7 @@ class ProcedureRecord:
                 f"{os.fspath(path)} is no record of a procedure",
                 expected="what `lungaccess replan --record` writes",
             ) from reason
-        if digest != plan_digest(plan):
+        if digest != _plan_digest(plan):
             raise PlanFileError(
                 f"{os.fspath(path)} is the record of another plan",
                 expected="the plan that the procedure carried out",
@@ -83,7 +83,7 @@ class ProcedureRecord:
         return record
 
 
-def plan_digest(plan: Plan) -> str:
+def _plan_digest(plan: Plan) -> str:
     """Return the SHA-256 of a plan as it is written."""
     return hashlib.sha256(to_json(plan).encode()).hexdigest()
 

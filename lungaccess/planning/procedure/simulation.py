@@ -272,7 +272,7 @@ class _Run:
             doubt = policy.doubt_of(chosen.frames[n], chosen.tips[n])
             unknown = truth.unknown_of(policy.errors, steering, doubt)
             one = truth.insert_needle(
-                policy.environment, query, path, PolicyReplanner(policy, query, path), attempt, true_tips[n],
+                policy.environment, query, path, _PolicyReplanner(policy, query, path), attempt, true_tips[n],
                 steering, unknown, np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key)),
             )  # fmt: skip
             made.append(one.arcs)
@@ -343,7 +343,7 @@ def _stage(stage: str, decided: list[_Decided]) -> StageReport:
     )
 
 
-class PolicyReplanner(Replanner):
+class _PolicyReplanner(Replanner):
     """Goes on by what the policy chooses; it searches where no path is proved, for one that ends nearer.
 
     Args:

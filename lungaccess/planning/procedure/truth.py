@@ -109,7 +109,7 @@ def needles_carried_out(arcs: Float, counts: Int, errors: Deviations, longest_mm
     )
 
 
-class SteeredTruth:
+class _SteeredTruth:
     """What really happens to a needle that is steered, under the errors of one attempt, and what is measured.
 
     Args:
@@ -186,10 +186,10 @@ def insert_needle(
     """Insert a needle from a true tip of the tubes, watched by a tracker and planned again on its way.
 
     It is planned for `query`, from where the tip is taken to be, and follows `path` first; in the environment
-    it goes on without a new path as long as the old one is clear.  For the rest see `SteeredTruth` and
+    it goes on without a new path as long as the old one is clear.  For the rest see `_SteeredTruth` and
     `Belief`.
     """
-    needle = TrueNeedle(SteeredTruth(attempt, steering, rng), true_tip, 0.0)
+    needle = TrueNeedle(_SteeredTruth(attempt, steering, rng), true_tip, 0.0)
     belief = Belief(query, unknown, steering.latency_mm)
     replans, stopped = steer(
         environment, needle, belief, path, replanner, branch=query.branch, step_mm=steering.measure_every_mm,

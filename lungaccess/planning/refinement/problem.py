@@ -211,7 +211,7 @@ class Problem:
         for name in ("order", "in_tissue", "exit", "slope", "tube", "wall", "beside", "middle"):
             if name in rows:
                 least[rows[name]], most[rows[name]] = -np.inf, np.inf
-        parameters = self._parameters(*one_tip(tip), self._model(shape, constant=True))
+        parameters = self._parameters(*_one_tip(tip), self._model(shape, constant=True))
         return layout.Numbers(parameters=parameters, lower=lower, upper=upper, least=least, most=most)
 
     def _model(self, shape: TubeShape, *, constant: bool = False) -> layout.ShapeModel:
@@ -376,7 +376,7 @@ class LocalAxis:
         return self._rows.moved(self._tip, min(max(shift_mm, self.low_mm), self.high_mm))
 
 
-def one_tip(tip: ScopeTip) -> tuple[Float, Float]:
+def _one_tip(tip: ScopeTip) -> tuple[Float, Float]:
     """Return the coefficients of an axis that is one tip."""
     points, tangents = np.zeros((3, layout.AXIS_DEGREE + 1)), np.zeros((3, layout.AXIS_DEGREE + 1))
     points[:, 0], tangents[:, 0] = tip.lps_from_scope_tip[:3, 3], tip.lps_from_scope_tip[:3, 2]

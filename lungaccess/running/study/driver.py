@@ -84,7 +84,7 @@ def open_results(
             expected="one of them: a scheduler has workers of its own",
             remedy="Leave out --workers",
         )
-    require_dask()
+    _require_dask()
     cache = cache or stated_cache()  # Workers of another machine do not have the environment of this one.
     with ResultsFile(path, create=True) as results, contextlib.ExitStack() as stack:
         stack.enter_context(sole_writer(path, path.parent, f".{path.name}.lock"))
@@ -112,7 +112,7 @@ class RunMaker:
         if missing:
             say("starting workers", None)
             client = self._client()
-            with interruptions_noted() as stop_if_interrupted:
+            with _interruptions_noted() as stop_if_interrupted:
                 _prepare(client, missing, self._cache, say)
                 for done, (run, found) in enumerate(each_done(client, answer, missing, self._cache), start=1):
                     made = found if isinstance(found, Answer) else _failed(run, found)
@@ -188,7 +188,7 @@ DASK_CONFIG = {
 }
 
 
-def require_dask() -> None:
+def _require_dask() -> None:
     """Raise StudyError unless the libraries of studies are installed."""
     try:
         import distributed  # noqa: F401
@@ -247,7 +247,7 @@ def _interruptions_ignored() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def interruptions_noted() -> Iterator[Callable[[], None]]:
+def _interruptions_noted() -> Iterator[Callable[[], None]]:
     """Yield a function that raises KeyboardInterrupt if Ctrl-C was pressed, or SIGTERM came, in the meantime.
 
     Python drops exceptions that are raised while an object is being deleted, as dask's futures are all the

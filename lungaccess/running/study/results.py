@@ -35,7 +35,7 @@ class ResultsFile:
                 expected="a results file of `lungaccess study run`",
                 remedy="Check the name, or run the study: lungaccess study run study.toml --out results.db",
             )
-        with file_errors(self.path):
+        with _file_errors(self.path):
             self._connection = sqlite3.connect(self.path, timeout=BUSY_S, isolation_level=None)
             try:
                 self._begin()
@@ -90,10 +90,10 @@ class ResultsFile:
 
     def rows(self, query: str, values: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query; FileError if the file cannot be read."""
-        with file_errors(self.path):
+        with _file_errors(self.path):
             cursor = self._connection.execute(query, values)
         while True:
-            with file_errors(self.path):
+            with _file_errors(self.path):
                 # Rows that are read at once: a few of them take no time, and all of them would fill the
                 # memory.
                 batch = cursor.fetchmany(1000)
@@ -103,7 +103,7 @@ class ResultsFile:
 
     def columns(self, query: str) -> tuple[str, ...]:
         """Return the names of the columns of a query; FileError if the file cannot be read."""
-        with file_errors(self.path):
+        with _file_errors(self.path):
             found = self._connection.execute(f"SELECT * FROM ({query}) LIMIT 0").description
         return tuple(each[0] for each in found)
 
@@ -124,17 +124,17 @@ class ResultsFile:
         A run that is there already stays as it is, unless it failed.  FileError is raised if the disk is
         full, another program holds the file for too long, or it is damaged.
         """
-        with file_errors(self.path), self._transaction() as connection:
+        with _file_errors(self.path), self._transaction() as connection:
             connection.execute(
                 "DELETE FROM runs WHERE key = ? AND id IN (SELECT runid FROM outcomes WHERE failed)",
                 (run.key,),
             )
             experiment, planner = self._experiment(run.problem), self._planner(run)
-            made = self._insert("runs", run_row(run, answer, experiment, planner), "INSERT OR IGNORE")
+            made = self._insert("runs", _run_row(run, answer, experiment, planner), "INSERT OR IGNORE")
             if made.rowcount == 0:
                 return False
             connection.execute(KERNELS_TABLE)
-            add_rest(connection, int(made.lastrowid or 0), answer)
+            _add_rest(connection, int(made.lastrowid or 0), answer)
             connection.execute(
                 "UPDATE experiments SET totaltime = totaltime + ?, runcount = (SELECT max(n) FROM "
                 "(SELECT count(*) AS n FROM runs WHERE experimentid = ? GROUP BY plannerid)) WHERE id = ?",
@@ -161,8 +161,8 @@ class ResultsFile:
         ).fetchone()
         if known:
             return int(known[0])
-        number = int(self._insert("experiments", experiment_row(problem)).lastrowid or 0)
-        self._insert("problems", problem_row(problem, number))
+        number = int(self._insert("experiments", _experiment_row(problem)).lastrowid or 0)
+        self._insert("problems", _problem_row(problem, number))
         return number
 
     def _insert(self, table: str, row: dict[str, Any], how: str = "INSERT") -> sqlite3.Cursor:
@@ -185,7 +185,7 @@ BUSY_S = 60.0
 
 
 @contextlib.contextmanager
-def file_errors(path: Path) -> Iterator[None]:
+def _file_errors(path: Path) -> Iterator[None]:
     """Turn what SQLite raises into a FileError that says what to do."""
     try:
         yield
@@ -294,7 +294,7 @@ COST_COLUMNS = {term.key: term.key for term in TERMS if not term.of_all} | {"len
 """The column of each cost of the needle; OMPL's benchmarks have one for the length."""
 
 
-def experiment_row(problem: Problem) -> dict[str, Any]:
+def _experiment_row(problem: Problem) -> dict[str, Any]:
     """Return a problem as a row in the table of OMPL's benchmarks."""
     return {
         "name": problem.case,
@@ -310,7 +310,7 @@ def experiment_row(problem: Problem) -> dict[str, Any]:
     }
 
 
-def problem_row(problem: Problem, experiment: int) -> dict[str, Any]:
+def _problem_row(problem: Problem, experiment: int) -> dict[str, Any]:
     """Return the rest of a problem as a row."""
     x, y, z = problem.target_lps
     same = ("objective", "target", "origin", "start", "iterations", "time_s")
@@ -329,7 +329,7 @@ def problem_row(problem: Problem, experiment: int) -> dict[str, Any]:
     }
 
 
-def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str, Any]:
+def _run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str, Any]:
     """Return a run as a row."""
     return {
         "experimentid": experiment,
@@ -350,7 +350,7 @@ def run_row(run: Run, answer: Answer, experiment: int, planner: int) -> dict[str
     }
 
 
-def add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:
+def _add_rest(connection: sqlite3.Connection, run: int, answer: Answer) -> None:
     """Store what a run ended with besides its row: outcome, plan, progress, findings and rejections."""
     outcome = (run, answer.outcome, answer.failed, answer.message, answer.advice)
     connection.execute("INSERT INTO outcomes VALUES (?, ?, ?, ?, ?)", outcome)

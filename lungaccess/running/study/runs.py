@@ -47,7 +47,7 @@ class Patient:
         return lung_key(dict(self.sources))
 
 
-def patient_of(case: Case, folder: Path) -> Patient:
+def _patient_of(case: Case, folder: Path) -> Patient:
     """Return the patient of a case, whose folder may lie in `folder`; LungaccessError if it is unreadable."""
     from anatomy.io.inputs import input_hashes
 
@@ -200,7 +200,7 @@ def runs_of(
     for case in study.case:
         (progress or (lambda _words: None))(f"targets of {case.name}")
         folder = Path(study.folder)
-        patient = patient_of(case, folder)
+        patient = _patient_of(case, folder)
         system = load_system(beside(case.system, folder), fissures_allowed=case.fissures_allowed)
         counted: dict[str, Any] = {}
         if case.errors:

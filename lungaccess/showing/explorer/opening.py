@@ -226,7 +226,7 @@ def with_nodule(point_lps: Float, source: PatientSource, turn: Turn) -> Part:
     from anatomy.segmentation.pipeline import read_ct
 
     folder, ct = source.patient, source.ct
-    made = segmentation_record(folder)
+    made = _segmentation_record(folder)
     if made is None or ct is None or made["given_files"]:
         raise SettingsError(
             f"{folder} was not made from a CT by this program alone",
@@ -266,7 +266,7 @@ def nodule_near(lung: Lung, point_lps: Float) -> int | None:
     return number if away_mm <= 3.0 else None
 
 
-def segmentation_record(folder: Path) -> dict[str, Any] | None:
+def _segmentation_record(folder: Path) -> dict[str, Any] | None:
     """Return with what a folder was segmented; None if it was not.
 
     Raises FileError if the record is damaged.

@@ -51,8 +51,8 @@ def overview_png(
         projection(style.panel(figure, box), plan, layers, view)
     zoom.exit_zoom(style.panel(figure, EXIT_IN), plan, layers)
     zoom.needle_zoom(style.panel(figure, NEEDLE_IN), plan, layers)
-    clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
-    text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
+    _clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
+    _text_panel(style.panel(figure, TEXT_IN), plan, lung, appraisal)
     _heading(figure, plan, appraisal)
     _legend(figure, layers, plan)
     return style.save_png(figure, path)
@@ -134,7 +134,7 @@ LEAST_TOP_MM, MOST_TOP_MM = 4.0, 15.0
 """Least and greatest upper end of the clearance axis, so that what is near and required fills it."""
 
 
-def clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
+def _clearance_panel(axes: Axes, plan: Plan, lung: Lung) -> None:
     """Plot the distance of tube and needle axis to each structure, and what is required."""
     _scope, tube, needle = plan.curves()
     tube_arc = tube.arc_length_mm
@@ -175,7 +175,7 @@ def _required_line(axes: Axes, plan: Plan, tube_arc: Float, along: Float) -> Non
     axes.stairs(levels, places, baseline=None, color=style.INK, lw=1.4, label="required", zorder=5)
 
 
-def text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> None:
+def _text_panel(axes: Axes, plan: Plan, lung: Lung, appraisal: Appraisal | None = None) -> None:
     """Write the key numbers of a plan, evenly over the height of a panel."""
     axes.set_axis_off()
     blocks = [(heading, rows) for heading, rows in key_numbers(plan, lung, appraisal) if rows]

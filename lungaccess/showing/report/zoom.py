@@ -70,7 +70,7 @@ def _cut_panel(
     uv = view.project(shown)
     drawing.fit(axes, uv.min(axis=0) - margin_mm, uv.max(axis=0) + margin_mm)
     paint_cut(axes, layers, view, through)
-    draw_devices_true_to_width(axes, plan, view)
+    _draw_devices_true_to_width(axes, plan, view)
     goal_marks(axes, plan, view)
     drawing.dress(axes, view, ticks=False)
 
@@ -82,7 +82,7 @@ def goal_marks(axes: Axes, plan: Plan, view: View) -> None:
         drawing.aim_mark(axes, view.project(np.asarray(plan.aim.point_lps)))
 
 
-def draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
+def _draw_devices_true_to_width(axes: Axes, plan: Plan, view: View) -> None:
     """Draw scope, tubes and needle as bands of their own width."""
     system = plan.system
     body, tube, needle = plan.curves()

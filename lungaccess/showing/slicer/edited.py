@@ -90,7 +90,7 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
         ends = np.stack([plan.needle.lps_from_start[:3, 3], plan.needle.end_lps])
         ends_mm = np.linalg.norm(points[[0, -1]] - ends, axis=1)
         if max(away.max(), ends_mm.max()) > MOVED_MM:
-            path = path_of_points(points, np.asarray(plan.needle.lps_from_start))
+            path = _path_of_points(points, np.asarray(plan.needle.lps_from_start))
             findings = _too_tight(path, points, plan)
             if findings:
                 findings += _of_polyline(plan, lung, points)
@@ -105,7 +105,7 @@ def check_curve(plan: Plan, lung: Lung, curve: Markup) -> EditedCurve:
     return EditedCurve(device=device, words=_words(device, away, points), plan=made, report=report)
 
 
-def path_of_points(points_lps: Float, lps_from_start: Float) -> ArcPath:
+def _path_of_points(points_lps: Float, lps_from_start: Float) -> ArcPath:
     """Return the arcs through points `(N, 3)`, one from each to the next, in the direction of a start pose.
 
     Arcs that continue one another are joined.  Raises SettingsError if fewer than two points are apart from

@@ -88,7 +88,7 @@ def export_slicer(
     items += region
     items += _write_anatomy(lung, target, tell)
     write_text(target / SCENE_FILE, scene(items))
-    write_text(target / ROUTE_FILE, route_text(plan, devices, lung.tree))
+    write_text(target / ROUTE_FILE, _route_text(plan, devices, lung.tree))
     plan.save(target / PLAN_FILE)
     # The work before it takes this share of the time.
     tell("breathing", 0.9)
@@ -173,7 +173,7 @@ _HEADING = (
 )
 
 
-def route_text(plan: Plan, curves: DeviceCurves, tree: AirwayTree) -> str:
+def _route_text(plan: Plan, curves: DeviceCurves, tree: AirwayTree) -> str:
     """Return the route of a plan through an airway tree as text, LPS mm, one point a line.
 
     Flags are 0 along the airway, 1 where one branch ends and the next begins, 2 for tubes and needle.

@@ -66,14 +66,14 @@ def device_points(plan: Plan) -> DevicePoints:
         kind = kinds[sum(middle > edge for edge in at_exit)]
         parts.append(_arcs(begin, end))
         rows.append((kind, radius + extra, radius))
-    points = [points_on_pieces(plan.scope.lps_from_scope_tip, pieces, arcs) for arcs in parts]
+    points = [_points_on_pieces(plan.scope.lps_from_scope_tip, pieces, arcs) for arcs in parts]
     if needle is not None and system.needle is not None:
         exempt = plan.exemption.needle_length_mm
         edges = _edges([exempt, needle.length_mm], needle.length_mm)
         for begin, end in zip(edges[:-1], edges[1:], strict=True):
             kind = rules.NEEDLE_AT_EXIT if 0.5 * (begin + end) < exempt else rules.NEEDLE
             arcs = _arcs(begin, end)
-            points.append(points_on_pieces(needle.lps_from_start, needle_pieces(needle), arcs))
+            points.append(_points_on_pieces(needle.lps_from_start, needle_pieces(needle), arcs))
             parts.append(length + arcs)
             rows.append((kind, plan.required_clearance_mm["needle"], system.needle.radius_mm))
     last = np.cumsum([len(each) for each in parts])
@@ -102,7 +102,7 @@ def _arcs(begin: float, end: float) -> Float:
     return np.linspace(begin, end, max(math.ceil((end - begin) / 0.05), 1) + 1)
 
 
-def points_on_pieces(frame: Float, pieces: Float, arcs_mm: Float) -> Float:
+def _points_on_pieces(frame: Float, pieces: Float, arcs_mm: Float) -> Float:
     """Return points `(N, 3)` at rising arc lengths `(N,)` along arcs from a frame, as `poses_on_pieces`."""
     points, begin, pose = np.zeros((len(arcs_mm), 3)), 0.0, np.asarray(frame)
     for n, (length, roll, curvature) in enumerate(pieces):
@@ -169,7 +169,7 @@ def _leaves(
     leaves, end = np.zeros((MOST_LEAVES, 5)), devices.points[-1]
     target = np.array(plan.goal_lps), miss_allowed(motion, tolerance_mm, distance_mm(end, tip))
     hole_mm = miss_allowed(motion, devices.hole_mm, distance_mm(devices.hole_lps, tip))
-    about = tissue_of(plan, lung), breath_of(motion, side), carrier(motion, tip, side)
+    about = _tissue_of(plan, lung), breath_of(motion, side), carrier(motion, tip, side)
     what = *about, devices.points, devices.arc_mm, devices.sections, *target, devices.hole_lps, hole_mm
     breath = float(motion.amplitude), float(motion.masks_phase)
     count = divide(*what, *breath, phases, all_of_it, leaves)
@@ -229,7 +229,7 @@ def carrier(motion: Motion, tip_lps: Float, side: int) -> Rigid:
     )
 
 
-def tissue_of(plan: Plan, lung: Lung) -> rules.Tissue:
+def _tissue_of(plan: Plan, lung: Lung) -> rules.Tissue:
     """Return what the devices of a plan collide with, for the kernels."""
     field = lung.obstacle_field(with_fissures=plan.fissures_are_obstacles)
     return rules.Tissue(

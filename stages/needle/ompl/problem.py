@@ -74,14 +74,14 @@ class NeedleProblem:
         self._own: dict[str, Any] = {}
         self._tolerance_mm = 0.0
         position = base.SE3StateSpace()
-        position.setBounds(position_bounds(environment))
+        position.setBounds(_position_bounds(environment))
         controls = control.RealVectorControlSpace(position, 3)
-        controls.setBounds(control_bounds(environment))
+        controls.setBounds(_control_bounds(environment))
         self.setup = control.SimpleSetup(controls)
         self.si = self.setup.getSpaceInformation()
         self.si.setPropagationStepSize(1.0 / ARC_STEPS)
         self.si.setMinMaxControlDuration(1, ARC_STEPS)
-        self.setup.setStatePropagator(propagator(environment, self._question))
+        self.setup.setStatePropagator(_propagator(environment, self._question))
         self.setup.setStateValidityChecker(validity(environment, self._question))
         self.planner = self.planners()[self.default](self.si)
         self.setup.setPlanner(self.planner)
@@ -247,7 +247,7 @@ def _termination(time_s: float, iterations: int = NO_LIMIT) -> Any:
     return base.plannerOrTerminationCondition(timed, counted)
 
 
-def position_bounds(environment: NeedleEnvironment) -> Any:
+def _position_bounds(environment: NeedleEnvironment) -> Any:
     """Bound positions by the box of the grid."""
     grid = environment.grid
     corners = grid.lps(list(itertools.product(*[(-0.5, n - 0.5) for n in grid.shape])))
@@ -258,7 +258,7 @@ def position_bounds(environment: NeedleEnvironment) -> Any:
     return bounds
 
 
-def control_bounds(environment: NeedleEnvironment) -> Any:
+def _control_bounds(environment: NeedleEnvironment) -> Any:
     """Bound length, roll and curvature of an arc, so that a step is at most 1 mm long."""
     bounds = base.RealVectorBounds(3)
     # Longest step of a propagation.
@@ -280,7 +280,7 @@ def _limits_of_steps(environment: NeedleEnvironment) -> Limits:
     return limits._replace(required_mm=max(limits.required_mm - 0.5 * MIN_GAP_MM, 0.0))
 
 
-def propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
+def _propagator(environment: NeedleEnvironment, question: Question) -> Callable[[Any, Any, float, Any], None]:
     """Return how OMPL moves a state by a control."""
     limits, obstacles = _limits_of_steps(environment), environment.obstacles
     costs = environment.cost_map

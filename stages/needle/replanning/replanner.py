@@ -41,17 +41,17 @@ STEP_MM = 0.25
 """Lengths of the arcs that are tried differ by this: half a voxel."""
 
 
-def structure_name(label: int) -> str:
+def _structure_name(label: int) -> str:
     """Return the name of the first obstacle that a voxel label stands for."""
     return next((name for name, bit in BITS.items() if label & bit), "nothing")
 
 
-def with_limits(environment: NeedleEnvironment, **limits: float) -> NeedleEnvironment:
+def _with_limits(environment: NeedleEnvironment, **limits: float) -> NeedleEnvironment:
     """Return an environment with other limits, by the names of `stages.needle.kernels.proof.Limits`."""
     return replace(environment, limits=environment.limits._replace(**limits))
 
 
-def blocker_at(
+def _blocker_at(
     environment: NeedleEnvironment, pose: tuple[float, ...], inserted_mm: float, branch: int
 ) -> int:
     """Return the label that the needle's point at the length `inserted_mm` is too near to, 0 if clear."""
@@ -59,7 +59,7 @@ def blocker_at(
     return int(blocker_on_arc(obstacles, limits, pose, straight, 0.0, inserted_mm, branch))
 
 
-def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, int]:
+def _tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, int]:
     """Return the distance (mm) of a query's start from what it keeps clear of, if near, and its label."""
     _clearance, labels, geometry, bits = environment.obstacles
     reach = environment.required_clearance_mm + EXACT_REACH_MM
@@ -73,7 +73,7 @@ def tip_clearance(environment: NeedleEnvironment, query: Query) -> tuple[float, 
     return float(distance), int(label)
 
 
-def roots_of_tip(
+def _roots_of_tip(
     environment: NeedleEnvironment, objective: ObjectiveArrays, query: Query, longest_mm: float
 ) -> tuple[list[Root], float]:
     """Return where to plan from, the nearest first, and the clearance proved on the way there.
@@ -84,12 +84,12 @@ def roots_of_tip(
     """
     required = environment.required_clearance_mm
     pose = pose_at(query.lps_from_start)
-    if not blocker_at(environment, pose, query.inserted_mm, query.branch):
+    if not _blocker_at(environment, pose, query.inserted_mm, query.branch):
         return [Root(query=query)], required
-    clearance, _label = tip_clearance(environment, query)
+    clearance, _label = _tip_clearance(environment, query)
     # An arc that leads away from an obstacle may come nearer by 0.1 mm first: bending takes a while.
     relaxed = min(max(environment.needle.radius_mm, clearance - 0.1), required)
-    near = with_limits(environment, required_mm=relaxed)
+    near = _with_limits(environment, required_mm=relaxed)
     roots = []
     for bend in _bends(environment, query):
         length = _length_to_clearance(environment, query, pose, bend, longest_mm)
@@ -116,7 +116,7 @@ def _length_to_clearance(
     """Return the length of an arc after which the required clearance is regained, 0 if never."""
     for n in range(1, int(longest_mm / STEP_MM) + 1):
         s = n * STEP_MM
-        if not blocker_at(environment, pose_on_arc(pose, bend, s), query.inserted_mm + s, query.branch):
+        if not _blocker_at(environment, pose_on_arc(pose, bend, s), query.inserted_mm + s, query.branch):
             return s
     return 0.0
 
@@ -194,7 +194,7 @@ def with_reserve(environment: NeedleEnvironment, reserve: float) -> NeedleEnviro
         raise SettingsError(f"The curvature reserve is {reserve}", expected="a share of at least 0, below 1")
     curvature = environment.needle.max_curvature_per_mm * (1.0 - reserve)
     needle = replace(environment.needle, max_curvature_per_mm=curvature)
-    return replace(with_limits(environment, kappa=curvature), needle=needle)
+    return replace(_with_limits(environment, kappa=curvature), needle=needle)
 
 
 def _arrived(query: Query, miss_mm: float) -> Replan:
@@ -241,7 +241,7 @@ class Replanner:
         self._objective, self._objective_arrays = objective, environment.objective_arrays(objective)
         self._iterations, self._seed, self._replans = iterations, seed, 0
         self._begin_mm, self._turned_rad = query.inserted_mm, query.turned_rad
-        exact = with_limits(environment, goal_tolerance_mm=0.0)
+        exact = _with_limits(environment, goal_tolerance_mm=0.0)
         self._variants = [exact]
         if settings.curvature_reserve > 0.0:
             self._variants.insert(0, with_reserve(exact, settings.curvature_reserve))
@@ -282,7 +282,7 @@ class Replanner:
             return _arrived(query, away)
         unreached = 1.0 - self.curvature_share
         bending = with_reserve(self._environment, unreached) if unreached else self._environment
-        roots, relaxed = roots_of_tip(bending, self._objective_arrays, query, self._settings.relaxed_mm)
+        roots, relaxed = _roots_of_tip(bending, self._objective_arrays, query, self._settings.relaxed_mm)
         if not roots:
             return self._stuck(query)
         failure, why = self._out_of_reach(bending, query)
@@ -363,9 +363,9 @@ class Replanner:
         if left <= index.MIN_ARC_MM:
             return Failure.OUT_OF_LENGTH, f"All of the needle ({limits.max_length_mm:g} mm) is inserted"
         if self._environment.goal_tolerance_mm == 0.0:
-            label = blocker_at(self._environment, (*query.goal, 0.0, 0.0, 1.0), math.inf, -1)
+            label = _blocker_at(self._environment, (*query.goal, 0.0, 0.0, 1.0), math.inf, -1)
             if label:
-                required, name = self._environment.required_clearance_mm, structure_name(label)
+                required, name = self._environment.required_clearance_mm, _structure_name(label)
                 return Failure.TARGET_BLOCKED, f"The target is nearer than {required:.2f} mm to {name}"
         pose, reference = pose_at(query.lps_from_start), tree.reference_of(root_of(query))
         angle = math.acos(float(np.clip(np.dot(pose[3:], reference), -1.0, 1.0)))
@@ -381,9 +381,9 @@ class Replanner:
         return None, ""
 
     def _stuck(self, query: Query) -> Replan:
-        clearance, label = tip_clearance(self._environment, query)
+        clearance, label = _tip_clearance(self._environment, query)
         radius = self._environment.needle.radius_mm
-        where = f"The axis at the tip is {clearance:.2f} mm from {structure_name(label)}"
+        where = f"The axis at the tip is {clearance:.2f} mm from {_structure_name(label)}"
         if clearance < radius + MIN_GAP_MM:
             why = f"{where}, the needle's radius is {radius:g} mm"
             return Replan(path=None, failure=Failure.TOUCHES, why=why)

@@ -320,14 +320,14 @@ def why_stopped(path: ScopePath, field: NavigationField, tree: AirwayTree) -> st
     width = float(lumen.width_from(numbers[0])[path.goal.voxel])
     if width < path.model.radius_mm and len(narrow):
         return (
-            f"too narrow {place_words(tree, route[narrow[0]])}: no ball thicker than {2.0 * width:.1f} mm "
+            f"too narrow {_place_words(tree, route[narrow[0]])}: no ball thicker than {2.0 * width:.1f} mm "
             f"gets from there to the goal, the scope with its gap is {2.0 * path.model.radius_mm:.1f} mm "
             "thick"
         )
-    return f"no motion found that leads on {place_words(tree, tip)}, though the lumen is wide enough"
+    return f"no motion found that leads on {_place_words(tree, tip)}, though the lumen is wide enough"
 
 
-def place_words(tree: AirwayTree, point_lps: Float) -> str:
+def _place_words(tree: AirwayTree, point_lps: Float) -> str:
     """Say in which generation and how far from the carina a point lies."""
     point = tree.nearest_point(point_lps)
     generation = int(tree.generation[tree.branch_of_point[point]])

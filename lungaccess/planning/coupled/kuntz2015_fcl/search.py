@@ -48,7 +48,7 @@ RRT_ITERATIONS = 50
 
 
 @frozen_record
-class Refusal:
+class _Refusal:
     """A plan of the reference that the planner's proof refuses: whether its tubes or its needle."""
 
     stage: str
@@ -103,7 +103,7 @@ class ReferenceSearch(ParallelSearch):
         self._needle_rrt = NeedleRRT(needle, needle.radius_mm + system.margins.total_mm, self.obstacles)
         self.counts: Counter[str] = Counter()
         self.spent_s: defaultdict[str, float] = defaultdict(float)
-        self.refused_by_proof: list[Refusal] = []
+        self.refused_by_proof: list[_Refusal] = []
 
     def further_steps(self) -> Iterator[Step]:
         """Draw placements without end; each is an iteration, and none depends on those before it."""
@@ -157,7 +157,7 @@ class ReferenceSearch(ParallelSearch):
                 return Candidate(tip=found.tip, deployment=deployment, path=path)
             stage = "needle"
         self._spend("proof", began)
-        self.refused_by_proof.append(Refusal(stage=stage, candidate=found))
+        self.refused_by_proof.append(_Refusal(stage=stage, candidate=found))
         return None
 
     def _spend(self, part: str, began: float) -> float:

@@ -148,7 +148,7 @@ class AimedFromPose:
         found, why = aiming.aim(
             task.target.lps_mm, row, np.ones(1, dtype=np.bool_), np.zeros(count, dtype=np.int64), starts
         )
-        reasons = reasons_of(why)
+        reasons = _reasons_of(why)
         self.reasons = {f"tube, aimed at the target: {name}": n for name, n in reasons.items()}
         for n in np.argsort(found[:, kernel.COST], kind="stable").tolist():
             if not np.isfinite(found[n, kernel.COST]):
@@ -183,7 +183,7 @@ def chosen_of(tubes: ConcentricTubes, found: Float) -> tuple[float, TubeShape]:
     return float(found[kernel.ROTATION]), shape_of_arrays(made)
 
 
-def reasons_of(why: Int) -> dict[str, int]:
+def _reasons_of(why: Int) -> dict[str, int]:
     """Return how many attempts (N,) each reason refused, in words."""
     codes, counts = np.unique(why, return_counts=True)
     names = {kernel.MISSES: NO_SOLUTION, kernel.SPOILT_WAY: NO_WAY, **REASONS}
@@ -226,7 +226,7 @@ class AimedTubes:
         ends = np.array([self.evaluator.aim(tip) for tip in tips[:, :3]]).reshape(-1, 3)
         return self._aiming.aim(ends, tips, allowed, np.arange(len(tips)), starts)
 
-    reasons = staticmethod(reasons_of)
+    reasons = staticmethod(_reasons_of)
     """Returns how many attempts (N,) each reason refused, in words."""
 
     def evaluate(self, chosen: Int, slack: float) -> tuple[Int, Float, float]:
@@ -236,7 +236,7 @@ class AimedTubes:
 
     def clear(self) -> Int:
         """Return the entries (C,) with a deployment that ends there, the cheapest first."""
-        return self.promising[cheapest_first(self.aim(self.promising)[0])]
+        return self.promising[_cheapest_first(self.aim(self.promising)[0])]
 
     def candidate(self, entry: int) -> Candidate | None:
         """Return the deployment from the scope tip of an entry, None if the tubes are refused."""
@@ -269,7 +269,7 @@ class AimedTubes:
         return self.evaluator.aimed(tip, *chosen_of(self.task.system.tubes, found))
 
 
-def cheapest_first(found: Float) -> Int:
+def _cheapest_first(found: Float) -> Int:
     """Return the rows (C,) of what was found (N, ...) that have a deployment, the cheapest first."""
     clear = np.flatnonzero(np.isfinite(found[:, kernel.COST]))
     return clear[np.argsort(found[clear, kernel.COST], kind="stable")]
@@ -304,7 +304,7 @@ class TubeSearch(base.ParallelSearch):
             chunk = near[begin : begin + CHUNK]
             found, why = self.arcs.aim(chunk)
             self.blocked.update(self.arcs.reasons(why))
-            order = cheapest_first(found)
+            order = _cheapest_first(found)
             yield base.Step(iteration=0, phase=phase)
             yield from self._finalists(phase, chunk[order], found[order])
             clear.append(chunk[order])
@@ -342,7 +342,7 @@ class TubeSearch(base.ParallelSearch):
                 break
             rows, why = self.arcs.aim_from(row.tips, row.proved, starts)
             self.blocked.update(self.arcs.reasons(why))
-            order = cheapest_first(rows)
+            order = _cheapest_first(rows)
             if len(order) and rows[order[0], kernel.COST] < best[kernel.COST]:
                 best, tip = rows[order[0]], self.evaluator.tip_rows.tip(row, int(order[0]))
         if best is first or best[kernel.COST] > base.ESTIMATE_SLACK * self.incumbent.cost:

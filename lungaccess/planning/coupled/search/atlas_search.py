@@ -24,7 +24,7 @@ from stages.needle import Needle, successive_halving
 from stages.tube import many_shapes, shapes_of
 
 
-class LocalSearchRounds:
+class _LocalSearchRounds:
     """Shares iterations among local searches."""
 
     phase = "local search"
@@ -125,7 +125,7 @@ class AtlasSearch(base.ParallelSearch):
             return
         settings, number = self.settings, self.share[0]
         local_search = LocalSearch(self.evaluator, self._rng)
-        rounds = LocalSearchRounds(self, local_search)
+        rounds = _LocalSearchRounds(self, local_search)
         starts = self._starts(local_search)
         sampled = self._sampled(local_search)
         searched = needle_searches(
@@ -166,7 +166,7 @@ class AtlasSearch(base.ParallelSearch):
 
     def _sampled(self, local_search: LocalSearch) -> Iterator[tuple[base.Step, Candidate | None]]:
         """Sample deployments near those of the atlas whose needle reaches the target, or nearly does."""
-        sampling = sampling_near_target(local_search, self.arcs, self._rng)
+        sampling = _sampling_near_target(local_search, self.arcs, self._rng)
         nothing = base.Step(iteration=0, phase="local sampling")
         while True:
             found = sampling.sample(self.settings.kept_slack * self.incumbent.cost)
@@ -225,7 +225,7 @@ class LocalSampling:
         return self._evaluator.direct(tip, *best.numbers)
 
 
-def sampling_near_target(
+def _sampling_near_target(
     local_search: LocalSearch, arcs: DirectArcs, rng: np.random.Generator
 ) -> LocalSampling:
     """Return local sampling around the deployments from which the needle reaches the target, or nearly does.

@@ -178,10 +178,10 @@ class WindowEvaluator(CandidateEvaluator):
     def evaluate(self, candidate: Candidate) -> float:
         """Return the cost of a candidate with that of the breath outside its window; infinite without one."""
         cost = super().evaluate(candidate)
-        return cost if self.window is None else cost + cost_outside(self.window.share)
+        return cost if self.window is None else cost + _cost_outside(self.window.share)
 
 
-def cost_outside(share: float) -> float:
+def _cost_outside(share: float) -> float:
     """Return what counts for the breath outside a window."""
     return OUTSIDE_COST * (1.0 - math.floor(STEPS * share) / STEPS)
 
@@ -227,7 +227,7 @@ class WindowAims:
         return np.where((self.misses_mm > 0.0)[:, None], np.nan, self.points)
 
 
-class WindowDirectSearch:
+class _WindowDirectSearch:
     """Evaluates the direct candidates of an atlas, those first that may be the best.
 
     Attributes:
@@ -257,7 +257,7 @@ class WindowDirectSearch:
         bounds = costs[self.blockers == 0] / base.ESTIMATE_SLACK
         if evaluator.widest:
             most = self.shares[self._arcs.atlas.deployments.site[clear]]
-            bounds += [cost_outside(share) for share in most.tolist()]
+            bounds += [_cost_outside(share) for share in most.tolist()]
         order = np.argsort(bounds, kind="stable")
         entries, bounds = clear[order], bounds[order]
         ranks = bounds + OUTSIDE_COST
@@ -280,7 +280,7 @@ class WindowSearch(AtlasSearch):
         self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)
         arcs = DirectArcs(evaluator.task, atlas, evaluator, self.aims.reached)
         super().__init__(evaluator.task, atlas, _SETTINGS, arcs)
-        self.windows = self.direct = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
+        self.windows = self.direct = _WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
     def _rounds(self) -> Iterator[base.Step]:
         varied_too = _variations(self.window_evaluator, self.incumbent, self.share[0])
@@ -297,7 +297,7 @@ class WindowTubeSearch(TubeSearch):
         self.window_evaluator, self.aims = evaluator, WindowAims.of(evaluator, atlas)
         arcs = AimedTubes(evaluator.task, atlas, evaluator, self.aims.reached)
         super().__init__(evaluator.task, atlas, arcs)
-        self.windows = WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
+        self.windows = _WindowDirectSearch(arcs, evaluator, self.aims.shares, self.incumbent)
 
     def direct_steps(self) -> Iterator[base.Step]:
         """Aim from the tips of the atlas, those first that may be the best."""

@@ -214,7 +214,7 @@ class BenchmarkQuery:
     target_lps: Point
 
 
-def queries_of(case: BenchmarkPhantom) -> Iterator[BenchmarkQuery]:
+def _queries_of(case: BenchmarkPhantom) -> Iterator[BenchmarkQuery]:
     """Yield the queries of a phantom, device by device."""
     for system in SYSTEMS:
         for number, point in enumerate(entries()[case.name].targets_lps, start=1):
@@ -224,7 +224,7 @@ def queries_of(case: BenchmarkPhantom) -> Iterator[BenchmarkQuery]:
 
 def all_queries() -> dict[str, BenchmarkQuery]:
     """Return all queries by name."""
-    return {query.name: query for case in benchmark_phantoms() for query in queries_of(case)}
+    return {query.name: query for case in benchmark_phantoms() for query in _queries_of(case)}
 
 
 def write_benchmark(
@@ -271,10 +271,10 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
     if with_tips:
         lung = build_lung(load_patient(home))
         for name in SYSTEMS:
-            write_json(home / tips_file(name), scope_tips(lung, name))
+            write_json(home / _tips_file(name), scope_tips(lung, name))
     queries = [
         {"name": query.name, "device": query.system, "target_lps": list(query.target_lps)}
-        for query in queries_of(case)
+        for query in _queries_of(case)
     ]
     about = {"benchmark": VERSION, "phantom": case.name, "family": case.family, "seed": case.seed}
     hashed = {"masks_sha256": entries()[case.name].masks_sha256, "traits": asdict(case.traits)}
@@ -295,7 +295,7 @@ def require_cases(folder: Path) -> tuple[BenchmarkPhantom, ...]:
     return tuple(phantom_named(str(name)) for name in content["phantoms"])
 
 
-def tips_file(system: str) -> str:
+def _tips_file(system: str) -> str:
     """Return the name of the file of tips of a device, in the folder of a phantom."""
     return f"tips-{system}.json"
 
@@ -331,7 +331,7 @@ class PublishedTips:
             FileError: If the file of tips cannot be read.
             SettingsError: If there is no tip of that number.
         """
-        path = self._folder / phantom / tips_file(system)
+        path = self._folder / phantom / _tips_file(system)
         if (phantom, system) not in self._read:
             self._read[phantom, system] = read_json(
                 path, expected="published tips", remedy="Make the cases with --tips"

@@ -55,7 +55,7 @@ def field_data(plan: Plan, lung: Lung) -> Packed:
     }
 
 
-def breath_data(plan: Plan, lung: Lung, found: Mapping[str, Any]) -> Packed:
+def _breath_data(plan: Plan, lung: Lung, found: Mapping[str, Any]) -> Packed:
     """Return what carries tubes and needle of a plan, its window, and what of `samples` is in no chart."""
     moving, window = Moving.of(plan, lung), plan.window
     return {
@@ -85,7 +85,7 @@ def samples(plan: Plan, lung: Lung) -> dict[str, Any]:
     lever = np.linalg.norm(points - plan.scope.lps_from_scope_tip[:3, 3], axis=1)
     required = required_mm(plan, along, start)
     kept = (required + share * lever) / (1.0 - share)
-    clearance = clearances_at(plan, lung, moving, phases)
+    clearance = _clearances_at(plan, lung, moving, phases)
     clearance["airway"][:, along < plan.tube.exit.arc_length_mm] = NOT_MEASURED
     limited = {k: v for k, v in clearance.items() if k != "fissure" or plan.fissures_are_obstacles}
     margin = np.min(list(limited.values()), axis=0) - required
@@ -107,7 +107,7 @@ def samples(plan: Plan, lung: Lung) -> dict[str, Any]:
     }
 
 
-def clearances_at(plan: Plan, lung: Lung, moving: Moving, phases: Float) -> dict[str, Float]:
+def _clearances_at(plan: Plan, lung: Lung, moving: Moving, phases: Float) -> dict[str, Float]:
     """Return exact distances `(K, N)` of tubes and needle to each structure, deformed, at phases `(K,)`.
 
     The rules are those of `deployment.profile`: up to `CAP_MM`, or less where tissue shrinks by more than
@@ -161,7 +161,7 @@ def packed_breath(plans: Sequence[Plan], lung: Lung, found: Sequence[Mapping[str
     """Return the data of the page for all plans with their `samples`; empty where the first has none."""
     if not found[0]:
         return {}
-    data = [breath_data(each, lung, sampled) for each, sampled in zip(plans, found, strict=True)]
+    data = [_breath_data(each, lung, sampled) for each, sampled in zip(plans, found, strict=True)]
     return {"breath": {**field_data(plans[0], lung), "plans": data}}
 
 
@@ -173,7 +173,7 @@ def window_headline(plan: Plan, lung: Lung, accepted: bool) -> str:
     if window is None:
         grade, said, clock = Grade.UNKNOWN, NO_WINDOW, ""
     else:
-        grade, said, clock = grade_of_window(window, accepted), window.words, clock_svg(window, accepted)
+        grade, said, clock = _grade_of_window(window, accepted), window.words, clock_svg(window, accepted)
         if not accepted:
             said = f"The check refuses this plan; its window is not confirmed. {said}"
     source = "" if window is None else f"<p class='note'>Motion: {words.text(window.motion_source)}.</p>"
@@ -184,7 +184,7 @@ def window_headline(plan: Plan, lung: Lung, accepted: bool) -> str:
     )
 
 
-def grade_of_window(window: BreathingWindow, accepted: bool) -> Grade:
+def _grade_of_window(window: BreathingWindow, accepted: bool) -> Grade:
     """Return how good the news of a window is: a model of other people's lungs promises nothing."""
     if not accepted or not len(window.phases):
         return Grade.POOR

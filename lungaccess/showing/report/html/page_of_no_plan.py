@@ -35,7 +35,7 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
         "advice": words.text(explanation.advice or "Nothing that was tried reaches the target"),
         "slice_controls": slice_controls(more=PLACES),
         "scene": scene_figure(),
-        "sections": sections_html(explanation),
+        "sections": _sections_html(explanation),
         "reasons": words.pairs("What was looked at, and what was ruled out", rows),
     }
     return write_page(path, "no_plan.html", MODULES, page_data(explanation, lung), parts)
@@ -62,7 +62,7 @@ def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
     }
 
 
-def sections_html(explanation: Explanation) -> str:
+def _sections_html(explanation: Explanation) -> str:
     """Return the sections of an explanation as tables."""
     from lungaccess.judging.explanation import sections
 

@@ -51,8 +51,8 @@ def reach_page(maps: Sequence[ReachMap], lung: Lung, path: str | os.PathLike[str
         ),
         "most_clearance": f"{CLEARANCE_MM[1]:g}",
         "scene": scene_figure(),
-        "volumes": volumes_section(maps),
-        "systems": systems_section(maps),
+        "volumes": _volumes_section(maps),
+        "systems": _systems_section(maps),
     }
     data = {
         "page": "reach", "patient": lung.name, "structures": structure_meshes(lung),
@@ -92,7 +92,7 @@ def _surfaces(reach: ReachMap) -> list[Packed]:
     ]  # fmt: skip
 
 
-def volumes_section(maps: Sequence[ReachMap]) -> str:
+def _volumes_section(maps: Sequence[ReachMap]) -> str:
     """Return a table of volumes by side for each system, in mL and as a share."""
     from lungaccess.planning.reachability import STATES
 
@@ -118,7 +118,7 @@ def volumes_section(maps: Sequence[ReachMap]) -> str:
     return "".join(tables) + f"<p class='note'>{note}</p>"
 
 
-def systems_section(maps: Sequence[ReachMap]) -> str:
+def _systems_section(maps: Sequence[ReachMap]) -> str:
     """Return a table of the systems: their sizes, and what each gains and loses beside the first."""
     rows = []
     for each in maps:

@@ -300,11 +300,11 @@ def _of_deviations(report: RiskReport) -> str:
         f"<p class='note'>{words.text(note)}</p>"
         + words.pairs("If the devices deviate", rows, SHARES)
         + words.pairs("Success with errors of one kind only", alone, SHARES)
-        + sensitivity_bars(report.sensitivity)
+        + _sensitivity_bars(report.sensitivity)
     )
 
 
-def sensitivity_bars(found: Sequence[Sensitivity]) -> str:
+def _sensitivity_bars(found: Sequence[Sensitivity]) -> str:
     """Return a drawing of what each kind of error has to do with success, "" without any."""
     if not found or not found[0].total:
         return ""

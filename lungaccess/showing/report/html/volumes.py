@@ -79,7 +79,7 @@ def page_image(lung: Lung, device_lps: Float, ct: Volume | None = None) -> Packe
 
     Raises AnatomyError if the CT does not hold the devices.
     """
-    labels = label_volumes(lung, device_lps)
+    labels = _label_volumes(lung, device_lps)
     return _image(lung, labels, ct, None if ct is None else ct_volumes(ct, lung, device_lps))
 
 
@@ -136,7 +136,7 @@ def label_codes(lung: Lung, low: ArrayLike, high: ArrayLike) -> Volume:
     return Volume(grid=lung.grid.crop(low, high), array=codes)
 
 
-def label_volumes(lung: Lung, device_lps: Float) -> list[Packed]:
+def _label_volumes(lung: Lung, device_lps: Float) -> list[Packed]:
     """Return the structures, coarse and fine, for a page; the coarse ones are kept with the lung."""
     coarse, fine = page_grids(lung.grid, device_lps)
     shape = np.array(lung.grid.shape)

@@ -103,6 +103,34 @@ def test_quiet_prints_json_and_errors_alone(
     assert "lung-default" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_view_of_a_ct_tells_its_address_alone(
+    fails: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The CT is segmented first, by a command that answers, too; its errors are told."""
+    from anatomy.base.errors import AnatomyError
+    from lungaccess.cli import lazy
+    from lungaccess.showing.explorer import Address, Explorer
+
+    async def serve(_explorer: Explorer, started: Any) -> None:
+        started(Address(port=8, token="t"))
+
+    def segment(*_: Any, **__: Any) -> None:
+        if fails:
+            raise AnatomyError("no lungs")
+        terminal.tell({"lungs": 2})
+        terminal.say("two lungs")
+
+    monkeypatch.setattr(lazy, "is_ct", lambda _path: True, raising=False)
+    monkeypatch.setattr("lungaccess.cli.commands.patients.segment", segment)
+    monkeypatch.setattr(Explorer, "serve", serve)
+    load_with(monkeypatch, lambda *_, **__: None)
+    code = cli.main(["view", "ct", "--out", str(tmp_path), "--no-browser", "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert code == (ExitCode.BAD_INPUT if fails else ExitCode.OK)
+    assert said["error"]["found"] == "no lungs" if fails else said["port"] == 8
+
+
 @given(
     st.recursive(st.floats() | st.text(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner))
 )

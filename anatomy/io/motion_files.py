@@ -111,7 +111,7 @@ def read_motion(keys: MotionFile, folder: Path, masks: Grid) -> MotionSource:
         return MotionSource(description=words, population_motion_mm=keys.population_motion_mm, **common)
     if keys.end_exhale:
         exhale, inhale = folder / keys.end_exhale, folder / keys.end_inhale
-        grid, vectors = register(exhale, inhale)
+        grid, vectors = _register(exhale, inhale)
         words = f"registration of {keys.end_exhale} and {keys.end_inhale}"
         return MotionSource(description=words, grid=grid, vectors=vectors, **common)
     path = require_file(folder / keys.file)
@@ -235,7 +235,7 @@ def write_vectors(path: str | Path, grid: Grid, vectors: Float) -> None:
     images.write_image(images.itk_image(vectors.astype(np.float32), grid), Path(path), components=3)
 
 
-def register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
+def _register(exhale: Path, inhale: Path) -> tuple[Grid, Float]:
     """Return a displacement field `(ni, nj, nk, 3)` LPS mm from end-exhale to end-inhale: a B-spline.
 
     CTs are compared by correlation; two masks by the distance to their borders, which tells nothing of the

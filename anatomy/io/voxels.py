@@ -26,10 +26,10 @@ def pieces(path: Path, offset: int = 0, *, compressed: bool | None = None) -> It
     with path.open("rb") as stream:
         packed = stream.read(2) == _MAGIC_GZIP if compressed is None else compressed
         stream.seek(offset)
-        yield from inflate(stream, path) if packed else iter(lambda: stream.read(PIECE_BYTES), b"")
+        yield from _inflate(stream, path) if packed else iter(lambda: stream.read(PIECE_BYTES), b"")
 
 
-def inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
+def _inflate(stream: BinaryIO, path: Path) -> Iterator[bytes]:
     """Yield the decompressed rest of `stream` (gzip, also several members, or zlib).
 
     Raises FileError if the stream is damaged or ends early; `path` is named.

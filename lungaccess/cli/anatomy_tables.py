@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from typing_extensions import TypeIs
 
 
-def is_lung(organ: lazy.Organ) -> TypeIs[lazy.Lung]:
+def _is_lung(organ: lazy.Organ) -> TypeIs[lazy.Lung]:
     """Tell whether an organ is a lung; a liver has neither tree nor lobes."""
     return isinstance(organ, lazy.Lung)
 
@@ -63,7 +63,7 @@ def organ_record(lung: lazy.Organ) -> dict[str, Any]:
         "start_names": list(lung.start_names),
         "targets_lps": [point.tolist() for point in lung.targets_lps],
         "target_names": list(lung.target_names),
-        **(_airways(lung) if is_lung(lung) else {}),
+        **(_airways(lung) if _is_lung(lung) else {}),
         "nodules": [
             {
                 "number": each.number,
@@ -73,7 +73,7 @@ def organ_record(lung: lazy.Organ) -> dict[str, Any]:
                 "centre_lps": each.centre_lps.tolist(),
                 **(
                     {"segment": lung.segment_at(each.centre_lps), "lobe": lung.lobe_at(each.centre_lps)}
-                    if is_lung(lung)
+                    if _is_lung(lung)
                     else {}
                 ),
             }
@@ -97,7 +97,7 @@ def _checks_table(lung: lazy.Organ) -> Table:
 
 def _breathing(lung: lazy.Organ) -> dict[str, Any]:
     """Return what is known of the breathing, as plain values; nothing where nothing is."""
-    motion = lung.motion if is_lung(lung) else None
+    motion = lung.motion if _is_lung(lung) else None
     if motion is None:
         return {}
     stated = picked(motion, "source key masks_phase amplitude hysteresis warning_only")
@@ -140,7 +140,7 @@ def _structure_voxels(lung: lazy.Organ) -> dict[str, int]:
     from anatomy import structures
 
     counts = {
-        f"inside the {'lung' if is_lung(lung) else 'liver'}": int(
+        f"inside the {'lung' if _is_lung(lung) else 'liver'}": int(
             np.count_nonzero((lung.labels & structures.OUTSIDE) == 0)
         )
     }
@@ -164,8 +164,8 @@ def anatomy_tables(lung: lazy.Organ, *, details: bool = False) -> list[Table]:
         terminal.table("Structures", ("structure", "volume, ml", "voxels"), _volume_rows(lung)),
         _nodule_table(lung),
         _checks_table(lung),
-        *(_tree_tables(lung, details) if is_lung(lung) else ()),
-        *(_motion_tables(lung) if is_lung(lung) else ()),
+        *(_tree_tables(lung, details) if _is_lung(lung) else ()),
+        *(_motion_tables(lung) if _is_lung(lung) else ()),
         terminal.table("Starts and targets", ("name", "LPS, mm"), places),
         terminal.table(
             "Sources", ("file", "SHA-256"), [(name, digest[:16]) for name, digest in lung.sources.items()]
@@ -183,7 +183,7 @@ def _nodule_table(lung: lazy.Organ) -> Table:
             f"{each.size.long_axis_mm:.1f} x {each.size.perpendicular_mm:.1f}",
             f"{each.size.volume_ml:.2f}",
             ", ".join(f"{c:.1f}" for c in each.centre_lps),
-            lung.region_at(each.centre_lps) if is_lung(lung) else "",
+            lung.region_at(each.centre_lps) if _is_lung(lung) else "",
         )
         for each in found
     ]
@@ -241,7 +241,7 @@ def _motion_tables(lung: lazy.Lung) -> list[Table]:
 
 def _patient_rows(lung: lazy.Organ) -> list[terminal.Row]:
     rows: list[terminal.Row] = [("working grid", lung.grid.describe())]
-    if not is_lung(lung):
+    if not _is_lung(lung):
         return rows
     rows += [
         ("carina, LPS mm", ", ".join(f"{c:.1f}" for c in lung.tree.carina_lps)),
@@ -283,7 +283,7 @@ def _repairs(lung: lazy.Lung) -> list[tuple[str, lazy.Repair]]:
 
 def _volume_rows(lung: lazy.Organ) -> list[terminal.Row]:
     ml = lung.grid.voxel_volume_mm3 / 1000.0
-    counts = _structure_voxels(lung) | (_lobe_voxels(lung) if is_lung(lung) else {})
+    counts = _structure_voxels(lung) | (_lobe_voxels(lung) if _is_lung(lung) else {})
     return [(name, f"{count * ml:.1f}", f"{count}") for name, count in counts.items()]
 
 

@@ -70,7 +70,7 @@ def labels_at(lung: "Lung", points_lps: Float) -> Labels:
     return labels
 
 
-def window_of(lung: "Lung", low: Int, high: Int) -> Labels:
+def _window_of(lung: "Lung", low: Int, high: Int) -> Labels:
     """Return the labels of the voxels `low <= ijk < high`, OUTSIDE beyond the lung's grid."""
     low, high = np.asarray(low), np.asarray(high)
     labels = np.full(tuple(high - low), structures.OUTSIDE, dtype=np.uint16, order="F")
@@ -98,7 +98,7 @@ def region_around(lung: "Lung", points_lps: Float, reach_mm: float) -> Region:
     high = np.ceil(fraction.max(axis=0) + reach).astype(np.int64) + 1
     low, high = np.maximum(low, -2), np.minimum(high, np.asarray(lung.labels.shape) + 2)
     high = np.maximum(high, low + 1)
-    return Region(grid=lung.grid.crop(low, high), labels=window_of(lung, low, high))
+    return Region(grid=lung.grid.crop(low, high), labels=_window_of(lung, low, high))
 
 
 TILE = 40
@@ -190,7 +190,7 @@ class Tiles:
 
     def _found(self, key: int, tile: tuple[int, ...]) -> Iterator[Cluster]:
         begin = np.asarray(tile) * TILE
-        body = _bodies(key, window_of(self.lung, begin - 1, begin + TILE + 1))
+        body = _bodies(key, _window_of(self.lung, begin - 1, begin + TILE + 1))
         core = body[1:-1, 1:-1, 1:-1]
         if not core.any():
             return

@@ -107,7 +107,7 @@ def _check_system(plan: Plan, found: Findings, system: System | None) -> None:
 def _check_required(plan: Plan, found: Findings) -> None:
     wanted = wanted_clearance_mm(plan.system)
     names = {name for stage in plan.clearance_mm.values() for name in stage}
-    known = set(plan.clearance_mm) == in_tissue(plan.system) and names <= STRUCTURES
+    known = set(plan.clearance_mm) == _in_tissue(plan.system) and names <= STRUCTURES
     found.true("clearance.names", known, ", ".join(sorted(names)))
     stated = plan.required_clearance_mm
     if found.true("clearance.required.names", set(stated) == set(wanted), ", ".join(stated)):
@@ -129,7 +129,7 @@ def wanted_clearance_mm(system: System) -> dict[str, float]:
     return wanted
 
 
-def in_tissue(system: System) -> set[str]:
+def _in_tissue(system: System) -> set[str]:
     """Return the names of the devices that leave the airway."""
     return {"tube"} if system.needle is None else {"tube", "needle"}
 

@@ -63,7 +63,9 @@ def windows(rng: scenes.Random) -> scenes.Case:
         wide = leaves[np.argsort(leaves[:, 0] - leaves[:, 1], kind="stable")][:12]
         for begin, end, state, _reason, _at in wide:
             for phase in begin + SHARES * (end - begin):
-                spare = spare_mm(lung.labels, grid, motion, rigid, points, target, float(phase) - MASKS_PHASE)
+                spare = _spare_mm(
+                    lung.labels, grid, motion, rigid, points, target, float(phase) - MASKS_PHASE
+                )
                 # How much farther than the nearest place of a voxel what these steps find may be.
                 if spare < -1e-3 if state == rules.CLEAR else state == rules.BLOCKED and spare > 0.05:
                     said = f"phases {begin:.4f} to {end:.4f} in state {state:.0f}"
@@ -91,7 +93,7 @@ def breathing(rng: scenes.Random) -> Motion:
     )  # fmt: skip
 
 
-def displaced(motion: Motion, points: Float) -> Float:
+def _displaced(motion: Motion, points: Float) -> Float:
     """Return the displacements `(N, 3)` of places of the masks, by other code than the kernels'."""
     from scipy.ndimage import map_coordinates
 
@@ -100,7 +102,7 @@ def displaced(motion: Motion, points: Float) -> Float:
     return np.stack([map_coordinates(nodes[..., n], at, order=1, mode="nearest") for n in range(3)], axis=1)
 
 
-def spare_mm(
+def _spare_mm(
     labels: Labels, grid: Grid, motion: Motion, rigid: Rigid, points: Float, target: Float, share: float
 ) -> float:
     """Return by how much all rules are kept in a phase, by samples of the moved voxels."""
@@ -111,7 +113,7 @@ def spare_mm(
         return np.asarray(rigid.centre + share * rigid.displacement + (place - rigid.centre) @ turn.T)
 
     def miss_mm(place: Float, of: Float) -> float:
-        return float(np.linalg.norm(rides(place) - of - share * displaced(motion, of[None])[0]))
+        return float(np.linalg.norm(rides(place) - of - share * _displaced(motion, of[None])[0]))
 
     def least_mm(first: int, bits: int, kept_mm: float, last: int | None = None) -> float:
         voxels = grid.lps(np.argwhere((labels & bits) != 0))
@@ -119,15 +121,15 @@ def spare_mm(
         nearest = voxels[voxel]
         # Towards the device, by what is left, and back into the box, again and again.
         for _ in range(STEPS):
-            left = devices[first:last][at] - nearest - share * displaced(motion, nearest)
+            left = devices[first:last][at] - nearest - share * _displaced(motion, nearest)
             nearest = np.clip(nearest + left, voxels[voxel] - 0.5, voxels[voxel] + 0.5)
-        left = devices[first:last][at] - nearest - share * displaced(motion, nearest)
+        left = devices[first:last][at] - nearest - share * _displaced(motion, nearest)
         return float(np.linalg.norm(left, axis=1).min(initial=FAR_MM)) - kept_mm
 
     devices = rides(points)
     inside = devices[:7].copy()
     for _ in range(60):
-        inside = devices[:7] - share * displaced(motion, inside)
+        inside = devices[:7] - share * _displaced(motion, inside)
     return min(
         TOLERANCE_MM - miss_mm(points[-1], target), HOLE_MM - miss_mm(points[8], points[8]),
         2.0 * rules.CORNER_MM - float(scenes.true_distances(labels, grid, inside, LUMEN).max()),

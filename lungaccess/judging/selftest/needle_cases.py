@@ -69,7 +69,7 @@ def tissue(rng: scenes.Random, vessels: int, wall_mm: float = math.inf) -> Needl
 START = pose([0.0, 0.0, -7.4], [0.1, 0.0, 1.0])
 
 
-def spare_mm(environment: NeedleEnvironment, path: ArcPath, branch: int) -> float:
+def _spare_mm(environment: NeedleEnvironment, path: ArcPath, branch: int) -> float:
     """Return the least true clearance of a path beyond what is required, by its samples."""
     labels, grid, limits = environment.obstacles.labels, environment.grid, environment.limits
     points, lengths = path.sample(SAMPLE_MM)
@@ -96,7 +96,7 @@ def arcs(rng: scenes.Random) -> scenes.Case:
 
     def contradiction() -> str:
         for path, branch, label in zip(paths, branches, labels, strict=True):
-            spare = spare_mm(environment, path, branch)
+            spare = _spare_mm(environment, path, branch)
             if spare < -scenes.ROUNDING_MM if label == 0 else spare > MIN_GAP_MM + SAMPLE_MM:
                 return f"blocking label {label}, true clearance beyond what is required {spare:.4f} mm"
         return ""
@@ -145,7 +145,7 @@ def _reaches(environment: NeedleEnvironment, path: ArcPath, target: Float) -> bo
         np.linalg.norm(path.frames()[-1][:3, 3] - target) < 1e-6
         and path.arcs[:, 2].max() <= limits.kappa * (1.0 + 1e-6)
         and path.max_angle_from_start_rad() <= limits.max_angle_rad + 1e-6
-        and spare_mm(environment, path, 0) >= -scenes.ROUNDING_MM
+        and _spare_mm(environment, path, 0) >= -scenes.ROUNDING_MM
     )
 
 
@@ -168,7 +168,7 @@ def no_path(rng: scenes.Random) -> scenes.Case:
     denied = proof.outcome == "no path"
 
     def contradiction() -> str:
-        exists = not walled and spare_mm(environment, path, -1) >= 0.0
+        exists = not walled and _spare_mm(environment, path, -1) >= 0.0
         return f"outcome: {proof.outcome}; a path exists: {exists}" if denied and exists else ""
 
     return scenes.Case(answers=np.array([denied, proof.states, proof.cell_mm]), contradiction=contradiction)

@@ -77,7 +77,7 @@ class ResultsFile:
 
     def _make(self) -> None:
         try:
-            self._connection.executescript(statements())
+            self._connection.executescript(_statements())
         except sqlite3.OperationalError:
             # Another process may have made the tables in between.
             if self._connection.in_transaction:
@@ -277,7 +277,7 @@ KERNELS_TABLE = """CREATE TABLE IF NOT EXISTS made_with (
 """The kernels that made a run; a file may lack the table, or a run its row."""
 
 
-def statements() -> str:
+def _statements() -> str:
     """Return what makes an empty results file, as one transaction."""
     words = ", ".join(f"('status', {number}, '{word}')" for number, word in enumerate(STATUS))
     return f"""

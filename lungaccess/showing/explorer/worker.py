@@ -123,7 +123,7 @@ class Ended:
     number: int | None = None
 
 
-class _Superseded(Exception):  # noqa: N818
+class Superseded(Exception):  # noqa: N818
     """A later question takes the place of the one that is being answered."""
 
 
@@ -146,7 +146,7 @@ class Turn:
         self.send(Part({"answer": "progress", "what": what, "share": share}))
 
     def check(self) -> None:
-        """Raise _Superseded if the answer is no longer wanted; may be called by several threads."""
+        """Raise Superseded if the answer is no longer wanted; may be called by several threads."""
         self._worker.check(self._asked)
 
     def give_way(self) -> None:
@@ -224,7 +224,7 @@ class Worker:
                 self._send(asked, part)
         except StopIteration:
             self._finish(asked, Part({"answer": "end"}))
-        except _Superseded:
+        except Superseded:
             pass
         except GONE:
             raise
@@ -254,7 +254,7 @@ class Worker:
         with self._lock:
             self._take_in(wait=False)
             if not self._is_wanted(asked):
-                raise _Superseded
+                raise Superseded
 
     def give_way(self) -> None:
         """See `Turn.give_way`: a slice of what gave way itself is not begun within another one."""

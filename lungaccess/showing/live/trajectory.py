@@ -252,7 +252,7 @@ def table_text(trajectory: Trajectory) -> str:
     pose = ("tip_x_mm", "tip_y_mm", "tip_z_mm", "tip_qx", "tip_qy", "tip_qz", "tip_qw")
     lines = [",".join(("time_s", "stage", *trajectory.joints, *pose))]
     tips = np.stack([trajectory.tips(stage)[n] for n, stage in enumerate(trajectory.stages)])
-    rows = np.column_stack([trajectory.values, tips[:, :3, 3], quaternions(tips)])
+    rows = np.column_stack([trajectory.values, tips[:, :3, 3], _quaternions(tips)])
     for time, stage, row in zip(trajectory.time_s, trajectory.stages, rows, strict=True):
         lines.append(",".join((_number(time), stage, *(_number(value) for value in row))))
     return "\n".join([*lines, ""])
@@ -292,13 +292,13 @@ def tip_path(trajectory: Trajectory, stage: str) -> dict[str, Any]:
                 "orientation": dict(zip("xyzw", turn.tolist(), strict=True)),
             },
         }
-        for n, tip, turn in zip(chosen, tips, quaternions(tips), strict=True)
+        for n, tip, turn in zip(chosen, tips, _quaternions(tips), strict=True)
     ]
     return {"header": _header(0.0), "poses": poses}
 
 
-def quaternions(poses: Float) -> Float:
-    """Return the rotations of poses `(N, 4, 4)` as unit quaternions `(N, 4)`, x, y, z, w, without jumps."""
+def _quaternions(poses: Float) -> Float:
+    """Return the rotations of poses `(N, 4, 4)` as unit _quaternions `(N, 4)`, x, y, z, w, without jumps."""
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     signs = [1.0]
     for one, other in pairwise(turns):

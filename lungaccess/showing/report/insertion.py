@@ -48,7 +48,7 @@ class Plane:
         axes.set(xlabel="towards the target, mm", ylabel="aside, mm", ylim=(-ASIDE_MM, ASIDE_MM))
 
 
-def modes(found: InsertionStudy) -> dict[str, tuple[str, Summary]]:
+def _modes(found: InsertionStudy) -> dict[str, tuple[str, Summary]]:
     """Return the colour and the insertions of both ways to insert, by the name of the way."""
     return {"open loop": (OPEN, found.open_loop), "closed loop": (CLOSED, found.closed_loop)}
 
@@ -59,7 +59,7 @@ def draw_paths(axes: Any, lung: Lung, found: InsertionStudy) -> None:
 
     plane = Plane(found.query)
     plane.show_obstacles(axes, lung)
-    for name, (colour, mode) in modes(found).items():
+    for name, (colour, mode) in _modes(found).items():
         for n, run in enumerate(mode.insertions):
             points, goal = plane.flat(run.lps_from_tip[:, :3, 3]), plane.flat(run.target_lps)
             axes.plot(*points.T, color=colour, lw=0.8, alpha=0.7, label=None if n else name)
@@ -81,7 +81,7 @@ def insertions_png(found: InsertionStudy, lung: Lung, path: str | os.PathLike[st
     left, right = figure.subplots(1, 2, gridspec_kw={"width_ratios": [1.5, 1.0]})
     draw_paths(left, lung, found)
     left.set_title("True paths; grey: what the plane of the plan cuts", fontsize=10)
-    for name, (colour, mode) in modes(found).items():
+    for name, (colour, mode) in _modes(found).items():
         errors = np.sort(mode.tip_errors_mm)
         share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
         right.step(errors, share, where="post", color=colour, label=name)

@@ -48,7 +48,7 @@ def overview_png(
     figure = style.new_figure(WIDTH_IN, HEIGHT_IN)
     layers = Layers(lung)
     for box, view in zip(PROJECTIONS_IN, STANDARD, strict=True):
-        projection(style.panel(figure, box), plan, layers, view)
+        _projection(style.panel(figure, box), plan, layers, view)
     zoom.exit_zoom(style.panel(figure, EXIT_IN), plan, layers)
     zoom.needle_zoom(style.panel(figure, NEEDLE_IN), plan, layers)
     _clearance_panel(style.panel(figure, CLEARANCE_IN), plan, lung)
@@ -58,7 +58,7 @@ def overview_png(
     return style.save_png(figure, path)
 
 
-def projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
+def _projection(axes: Axes, plan: Plan, layers: Layers, view: View) -> None:
     """Draw anatomy and all three stages as seen along a view."""
     frame = layers.footprint("lung", view) or layers.footprint("airway", view)
     scope = view.project(plan.curves().scope.points_lps)

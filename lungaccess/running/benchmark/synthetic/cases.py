@@ -271,7 +271,7 @@ def _write_case(case: BenchmarkPhantom, home: Path, *, with_ct: bool, with_tips:
     if with_tips:
         lung = build_lung(load_patient(home))
         for name in SYSTEMS:
-            write_json(home / _tips_file(name), scope_tips(lung, name))
+            write_json(home / _tips_file(name), _scope_tips(lung, name))
     queries = [
         {"name": query.name, "device": query.system, "target_lps": list(query.target_lps)}
         for query in _queries_of(case)
@@ -300,7 +300,7 @@ def _tips_file(system: str) -> str:
     return f"tips-{system}.json"
 
 
-def scope_tips(lung: Lung, system: str) -> dict[str, Any]:
+def _scope_tips(lung: Lung, system: str) -> dict[str, Any]:
     """Return places where the scope of a device can stand, each with the motion that leads there.
 
     `lps_from_entry` is one for all; each of `tips` has `lps_from_tip` (4x4, LPS mm) and `states` of advance

@@ -41,7 +41,7 @@ def shown_window(plan: Plan, lung: Lung) -> BreathingWindow | None:
     return None if lung.motion is None else plan.window
 
 
-def field_data(plan: Plan, lung: Lung) -> Packed:
+def _field_data(plan: Plan, lung: Lung) -> Packed:
     """Return the displacement that moves the anatomy of a page: a volume in `FIELD_STEP_MM` for each axis."""
     moving = Moving.of(plan, lung)
     motion = moving.tissue
@@ -162,7 +162,7 @@ def packed_breath(plans: Sequence[Plan], lung: Lung, found: Sequence[Mapping[str
     if not found[0]:
         return {}
     data = [_breath_data(each, lung, sampled) for each, sampled in zip(plans, found, strict=True)]
-    return {"breath": {**field_data(plans[0], lung), "plans": data}}
+    return {"breath": {**_field_data(plans[0], lung), "plans": data}}
 
 
 def window_headline(plan: Plan, lung: Lung, accepted: bool) -> str:

@@ -137,10 +137,10 @@ def surface(volume: Volume, look: Look) -> tuple[Float, Int]:
 
     mesh = smooth_surface(_thinned(volume, look.stride))
     cell_mm = look.cell_mm
-    vertices, faces = gathered(mesh.vertices_lps, mesh.faces, cell_mm)
+    vertices, faces = _gathered(mesh.vertices_lps, mesh.faces, cell_mm)
     while len(faces) > look.most_faces:
         cell_mm *= 1.2
-        vertices, faces = gathered(mesh.vertices_lps, mesh.faces, cell_mm)
+        vertices, faces = _gathered(mesh.vertices_lps, mesh.faces, cell_mm)
     if not len(faces):
         vertices, faces = np.array(mesh.vertices_lps), np.array(mesh.faces)
     return smoothed(vertices, faces), faces
@@ -157,7 +157,7 @@ def _thinned(volume: Volume, stride: int) -> Volume:
     return Volume(grid=type(grid)(shape=grid.shape, lps_from_ijk=matrix), array=array)
 
 
-def gathered(vertices: Float, faces: Int, cell_mm: float) -> tuple[Float, Int]:
+def _gathered(vertices: Float, faces: Int, cell_mm: float) -> tuple[Float, Int]:
     """Join the vertices in each cell into their mean, and drop triangles that are none any more.
 
     Args:

@@ -38,10 +38,10 @@ def no_plan_page(explanation: Explanation, lung: Lung, path: str | os.PathLike[s
         "sections": _sections_html(explanation),
         "reasons": words.pairs("What was looked at, and what was ruled out", rows),
     }
-    return write_page(path, "no_plan.html", MODULES, page_data(explanation, lung), parts)
+    return write_page(path, "no_plan.html", MODULES, _page_data(explanation, lung), parts)
 
 
-def page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
+def _page_data(explanation: Explanation, lung: Lung) -> dict[str, Any]:
     """Return what the scripts of the page draw, as plain JSON values."""
     target = explanation.target.lps_mm
     paths = list(_paths(explanation))

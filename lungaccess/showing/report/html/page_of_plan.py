@@ -92,7 +92,7 @@ def plan_page(
     drawn, told = (None, region) if isinstance(region, str) else (region, region.words)
     window = breathing.shown_window(plan, lung)
     moved: list[dict[str, Any]] = [{} if window is None else breathing.samples(each, lung) for each in plans]
-    data = page_data(plans, appraisals, lung, chosen, drawn, moved)
+    data = _page_data(plans, appraisals, lung, chosen, drawn, moved)
     parts = {
         "title": words.text(f"Plan for {plan.patient_name}"),
         "glance": glance_section(plan, first),
@@ -185,7 +185,7 @@ def start_region_of(plan: Plan, lung: Lung) -> StartRegion | str:
         return f"No safe start region: {reason.found}"
 
 
-def page_data(
+def _page_data(
     plans: Sequence[Plan],
     appraisals: Sequence[Appraisal],
     lung: Lung,

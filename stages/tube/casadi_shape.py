@@ -320,10 +320,15 @@ def derive_arrival(
     """Return the frames `(4, 4)` of the tubes' tip without a needle, and of a needle's that has come to it.
 
     With its tip at theirs a needle is one more tube, the innermost and straight.  No tissue holds the tubes.
-    Raises ConvergenceError if no equilibrium is found, and SettingsError if the insertions are impossible.
+    Raises ConvergenceError if no equilibrium is found, as of tubes that snap on their way, and SettingsError
+    if the insertions are impossible.
     """
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)
+    if np.ptp(turned) > 0.0:
+        # Tubes that are turned against each other may have several shapes: theirs is the one they come to.
+        alone, together_with = (derive_shape(tubes, rotations_rad, out, needle=one) for one in (None, needle))
+        return alone.base_from_tip, together_with.base_from_tip
     beta = out - [tube.length_mm for tube in tubes]
     rear = out[0] + BEYOND_MM - needle.length_mm
     before = CasadiTubes(tubes).solve(turned, beta)
@@ -338,7 +343,7 @@ def derive_inserted(
     turned = np.asarray(rotations_rad, dtype=np.float64) + BEND_RAD
     out = np.asarray(insertions_mm, dtype=np.float64)
     beta = out - [tube.length_mm for tube in tubes]
-    # Tubes that are turned against each other may have several shapes: theirs is the one they come to.
+    # The shape to which turned tubes come, as in `derive_arrival`.
     begun = derive_shape(tubes, rotations_rad, out, needle=needle) if np.ptp(turned) > 0.0 else None
     return derive_loaded(tubes, needle, turned, beta, float(out[0] + needle_mm), begun=begun).base_from_tip
 

@@ -24,7 +24,7 @@ from stages.tube import (
     together,
     tube_shapes,
 )
-from stages.tube.casadi_shape import derive_inserted, derive_loaded, derive_shape
+from stages.tube.casadi_shape import derive_arrival, derive_inserted, derive_loaded, derive_shape
 from stages.tube.device import Tube
 from stages.tube.kernels.shapes import TIP
 from tests.stages.tube.pairs import WIDE
@@ -257,6 +257,9 @@ def test_a_needle_that_is_inserted_leaves_opposed_tubes_in_the_shape_that_they_c
     for needle_mm in (5.0, 60.0):
         inserted = derive_inserted(tubes, shaft, turned, out, needle_mm)[:3, 3]
         assert inserted == pytest.approx(come_to, abs=1e-4)
+    before, arrived = (tip[:3, 3] for tip in derive_arrival(tubes, shaft, turned, out))
+    assert before == pytest.approx(derive_shape(tubes, turned, out).base_from_tip[:3, 3], abs=1e-9)
+    assert arrived == pytest.approx(come_to, abs=1e-9)
     beta = out - [tube.length_mm for tube in tubes]
     other = derive_loaded(tubes, shaft, turned + BEND_RAD, beta, 84.0).base_from_tip[:3, 3]
     assert np.linalg.norm(other - come_to) > 1.0

@@ -12,7 +12,8 @@ PROCESSORS = {"x86_64": "x86-64-v2", "amd64": "x86-64-v2", "arm64": "generic", "
 """LLVM's names by those that Python has for machines.
 
 All x86-64 processors since 2009 follow the second level.  Kernels gain nothing from later instructions:
-118,000 shapes of two tubes a second with the second level, the third, and those of the machine itself.
+285,000 shapes of two tubes a second with the second level, 292,000 with the third, and 255,000 with those of
+the machine itself.
 """
 
 

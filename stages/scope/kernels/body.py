@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.base.typed import Float, UInt16
-from anatomy.kernels.compiling import inner_kernel, kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel
 from anatomy.kernels.field import EXACT_REACH_MM, MIN_GAP_MM, distance_bound, exact_distance
 from anatomy.kernels.labels import OUTSIDE
 
@@ -44,7 +44,7 @@ class Walls(NamedTuple):
     depth_geometry: Float
 
 
-@inner_kernel
+@borrowing_kernel
 def arc_parts(kappa, length):
     """Return how far an arc goes ahead, and its way aside divided by its curvature."""
     angle = kappa * length
@@ -53,7 +53,7 @@ def arc_parts(kappa, length):
     return math.sin(angle) / kappa, 2.0 * (math.sin(0.5 * angle) / kappa) ** 2
 
 
-@inner_kernel
+@borrowing_kernel
 def move_along(base, u, v, length, out):
     """Fill `out` (12,), which may be `base`, with the frame at `length` mm along the arc from the base."""
     kappa2 = u * u + v * v
@@ -70,7 +70,7 @@ def move_along(base, u, v, length, out):
         out[9 + k] = base[9 + k] + ahead * z + aside * across
 
 
-@inner_kernel
+@borrowing_kernel
 def point_along(base, u, v, length):
     """Return the point at `length` mm along the arc that starts at a base frame."""
     ahead, aside = arc_parts(math.sqrt(u * u + v * v), length)
@@ -83,7 +83,7 @@ def point_along(base, u, v, length):
     )
 
 
-@inner_kernel
+@borrowing_kernel
 def room_at(walls, radius, x, y, z):
     """Return a lower bound on the room around a ball of `radius`, negative if the wall may cut it."""
     bound = distance_bound(walls.depth, walls.depth_geometry, x, y, z)
@@ -96,7 +96,7 @@ def room_at(walls, radius, x, y, z):
     return exact_distance(walls.solid, walls.geometry, x, y, z, _OUTSIDE, _NOBODY, cap)[0] - radius
 
 
-@inner_kernel
+@borrowing_kernel
 def room_along(walls, radius, base, u, v, begin, end, growth, longest_step):
     """Return a room that is there all along an arc from `begin` to `end` mm, BLOCKED if none is proved.
 
@@ -123,7 +123,7 @@ def room_along(walls, radius, base, u, v, begin, end, growth, longest_step):
         at -= step
 
 
-@inner_kernel
+@borrowing_kernel
 def along_setting(walls, radius, length, base, twist, bend, growth, longest_step):
     """Return the room along a section of given twist and bend; see `room_along`."""
     u = bend / length * math.cos(twist)
@@ -131,7 +131,7 @@ def along_setting(walls, radius, length, base, twist, bend, growth, longest_step
     return room_along(walls, radius, base, u, v, 0.0, length, growth, longest_step)
 
 
-@inner_kernel
+@borrowing_kernel
 def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, finest, longest_step):
     """Return a room that is there all along a steady change of twist and bend, BLOCKED if none is proved.
 
@@ -171,7 +171,7 @@ def change_room(walls, radius, length, base, twist, bend, to_twist, to_bend, fin
     return least
 
 
-@inner_kernel
+@borrowing_kernel
 def turn_room(walls, radius, length, base, twist, bend, to_twist, to_bend, by_straight):
     """Return a room that is there all along a change in place, which may go by the straight section."""
     if not by_straight:
@@ -183,7 +183,7 @@ def turn_room(walls, radius, length, base, twist, bend, to_twist, to_bend, by_st
     return min(room, after)
 
 
-@inner_kernel
+@borrowing_kernel
 def nearest_setting(twist, bend, u, v, length, least_bend, most_bend):
     """Return twist and bend of a curvature vector, and whether to change to them by the straight section.
 

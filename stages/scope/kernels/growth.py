@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.base.typed import Float
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, inner_kernel, kernel, merged_kernel
 from stages.scope.kernels.body import move_along, nearest_setting, point_along, room_along, room_at, turn_room
 
 BASE, U, V, TWIST, BEND, TIP, HEADING, NEAR, COST, ROOM, CURVATURE = 0, 12, 13, 14, 15, 16, 19, 22, 23, 24, 25
@@ -41,7 +41,7 @@ class Route(NamedTuple):
     room: Float
 
 
-@inner_kernel
+@borrowing_kernel
 def nearest_on_route(points, near, x, y, z):
     """Return the route point nearest to a point, near another one, and the squared distance."""
     best = (points[near, 0] - x) ** 2 + (points[near, 1] - y) ** 2 + (points[near, 2] - z) ** 2
@@ -81,7 +81,7 @@ def pursuit(points, base, near, ahead_mm):
     )
 
 
-@inner_kernel
+@borrowing_kernel
 def settle(route, length, state, scratch):
     """Fill in tip, direction and route point of a state; return its cost: off-axis share and angle."""
     u, v = state[U], state[V]
@@ -102,7 +102,7 @@ def settle(route, length, state, scratch):
     return cost
 
 
-@inner_kernel
+@borrowing_kernel
 def same(a, b):
     """Tell whether two states are about the same: tips and bases near each other, and their directions."""
     far = 0.0
@@ -113,7 +113,7 @@ def same(a, b):
     return far / TIP_MM**2 + turned / TIP_RAD**2 < 1.0
 
 
-@inner_kernel
+@borrowing_kernel
 def follow(walls, device, before, state, by_straight, step):
     """Prove the way from one state to the next, and fill in its least room; tell whether it is free."""
     far = device.length + step

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from anatomy.base.typed import Bool, Float, Int
-from anatomy.kernels.compiling import inner_kernel, kernel, merged_kernel
+from anatomy.kernels.compiling import borrowing_kernel, kernel, merged_kernel
 from stages.scope.kernels.body import BLOCKED, move_along, nearest_setting, room_along, turn_room
 from stages.scope.kernels.growth import BEND, CURVATURE, ROOM, TWIST, U, V
 
@@ -56,7 +56,7 @@ class Places(NamedTuple):
     least_cosine: float
 
 
-@inner_kernel
+@borrowing_kernel
 def nearest_place(places, x, y, z):
     """Return the nearest tree point, -1 if a tip would be too far off the axis."""
     cell = places.off_axis_mm
@@ -79,7 +79,7 @@ def nearest_place(places, x, y, z):
     return nearest
 
 
-@inner_kernel
+@borrowing_kernel
 def kind_of(places, near, tip):
     """Return the group of a tip that is nearest to a tree point, and what the tip costs within it.
 
@@ -114,7 +114,7 @@ def kind_of(places, near, tip):
     return places.slots[1, near] + (ring * AZIMUTHS + spoke) * SIDES + side, cost
 
 
-@inner_kernel
+@borrowing_kernel
 def setting_beside(device, most_curvature, state, offset, own):
     """Return a section's curvature vector, twist, bend (inf: none) and by_straight beside a state's."""
     u = state[U] + offset[0]
@@ -198,7 +198,7 @@ def goes_by_straight(twist, bend, to_twist, to_bend):
     return change > abs(bend) + abs(to_bend)
 
 
-@inner_kernel
+@borrowing_kernel
 def put_tip(base, twist, bend, length, tip, scratch):
     """Fill in point, direction and +x (9,) of the tip of a section."""
     cosine = math.cos(twist)
@@ -258,7 +258,7 @@ def shifted_tips(walls, device, entry, states, shifts, tips, rooms):
             put_tip(base, twist, bend, length, tips[k], scratch)
 
 
-@inner_kernel
+@borrowing_kernel
 def _most_error(walls, radius, base, u, v, begin, end, growth, longer, wider, most):
     """Return the largest error, 0 to `most`, at which an arc has room from `begin` to `end` mm; 0 if none.
 

@@ -11,14 +11,13 @@ import numpy as np
 from anatomy import structures
 from anatomy.airway_tree import AirwayTree
 from anatomy.base.errors import AnatomyError
-from anatomy.base.records import frozen_record
 from anatomy.base.typed import Array, Float, Int, Mask, UInt16
 from anatomy.fields import DistanceField, corner_geometry, distance_corners, distance_field, renewed_corners
 from anatomy.grid import Grid, Volume
 from anatomy.lobes import FISSURES_UNKNOWN, UNKNOWN
 from anatomy.lung import Lung
 from anatomy.mask_findings import mask_findings
-from anatomy.morphology import Window, bounds, hull, window
+from anatomy.morphology import Window, bounds, window
 from anatomy.patient import PatientImages
 from anatomy.plausibility import warnings_of_findings, with_accepted
 from anatomy.sides import border_of, coarse_sides, points_of_sides
@@ -36,6 +35,8 @@ PAD_VOXELS = 2
 SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
 """The clearance fields that are made of a structure; the others are made of these."""
 
+MARKED = ("lung", "lumen", "wall", "fissure_band", "vessels", "nodules", "fissures")
+"""The images that labels are made of; the last three mark voxels by themselves."""
 CUT = ("nodules", "nodule_labels", "cost", "lobes", "fissure_band")
 """The images that a lung holds as they were read, cut to its box."""
 AS_READ = ("name", "kind", "starts", "targets_lps", "start_names", "target_names", "sources")
@@ -80,23 +81,19 @@ class Reused:
         return known[1]
 
     def changed(self, images: PatientImages) -> Window | None:
-        """Return the box of voxels in which vessels, nodules or fissures have changed, and nothing else has.
+        """Return the box of voxels in which vessels, nodules or fissures alone have changed.
 
         It is None if something else has changed, or nothing is known of before.
         """
-        before = self._images
-        if before is None or (before.fissures is None) != (images.fissures is None):
+        old = self._images
+        same = old is not None and np.array_equal(old.grid.lps_from_ijk, images.grid.lps_from_ijk)
+        if old is None or not same or (old.fissures is None) != (images.fissures is None):
             return None
-        if not np.array_equal(before.grid.lps_from_ijk, images.grid.lps_from_ijk):
-            return None
-        if not all(
-            _are_same(_array_of(before, name), _array_of(images, name))
-            for name in ("lung", "lumen", "wall", "fissure_band")
-        ):
+        pairs = {name: (_array_of(old, name), _array_of(images, name)) for name in MARKED}
+        if not all(_are_same(*pairs[name]) for name in MARKED[:4]):
             return None
         found = np.zeros(images.grid.shape, dtype=np.bool_, order="F")
-        for name in ("vessels", "nodules", "fissures"):
-            one, other = _array_of(before, name), _array_of(images, name)
+        for one, other in map(pairs.__getitem__, MARKED[4:]):
             if one is not other:
                 found |= np.not_equal(False if one is None else one, False if other is None else other)
         return window(*bounds(found))
@@ -121,10 +118,11 @@ class WorkingBox:
         self._start = low - PAD_VOXELS
         self._stop = high + PAD_VOXELS
         self.grid: Grid = grid.crop(self._start, self._stop)
+        self.whole = window(low * 0, high - low + 2 * PAD_VOXELS)
 
     def cut(self, array: Array, part: Window | None = None) -> Array:
         """Copy what of `array` lies in the box, or in a window of it; 0 beyond the image."""
-        part = part or window(np.zeros(3, dtype=np.int64), np.array(self.grid.shape))
+        part = part or self.whole
         start = self._start + [axis.start for axis in part]
         out = np.zeros([axis.stop - axis.start for axis in part], dtype=array.dtype, order="F")
         low, high = np.maximum(start, 0), np.minimum(start + out.shape, array.shape)
@@ -133,11 +131,8 @@ class WorkingBox:
 
     def window(self, part: Window) -> Window:
         """Return what of a window of the image lies in the box, as a window of the box."""
-        low, high = (
-            np.clip([getattr(axis, end) for axis in part] - self._start, 0, self.grid.shape)
-            for end in ("start", "stop")
-        )
-        return window(low, np.maximum(low, high))
+        ends = np.array([[axis.start, axis.stop] for axis in part]) - self._start[:, None]
+        return window(*np.clip(ends.T, 0, self.grid.shape))
 
 
 def build_lung(
@@ -180,13 +175,13 @@ def build_lung(
     tell("labels")
     lung, wall = images.lung.array, _array_of(images, "wall")
     box = reused.get("box", (lung, lumen.array), lambda: WorkingBox(lung | lumen.array, images.grid))
-    sides = reused.get("sides", (lung, lumen.array, wall), lambda: _sides(images, box))
-    changed = reused.changed(images)
-    changed = None if changed is None else box.window(changed)
-    labels = keep("labels", _labels(images, box, tree, sides, reused, changed))
-    warnings += _warnings(images, sides)
+    lungs_lps, septum = reused.get("sides", (lung, lumen.array, wall), lambda: _sides(images, box))
+    part = reused.changed(images)
+    before, changed = (None, None) if part is None else (reused.lung, box.window(part))
+    labels = keep("labels", _labels(images, box, tree, septum, before, changed))
+    warnings += _warnings(images, septum)
     tell("plausibility of the masks")
-    findings = with_accepted(mask_findings(images, tree, sides.points_lps, reused.get), images.accepted)
+    findings = with_accepted(mask_findings(images, tree, lungs_lps, reused.get), images.accepted)
     motion = None
     if images.motion is not None:
         from anatomy.motion.prepare import prepare_motion
@@ -203,15 +198,7 @@ def build_lung(
         key=key or lung_key(images.sources),
         grid=box.grid,
         labels=labels,
-        fields=clearance_fields(
-            labels,
-            box.grid,
-            fissures=images.fissures is not None,
-            keep=keep,
-            tell=tell,
-            before=None if changed is None else reused.lung,
-            changed=changed,
-        ),  # fmt: skip
+        fields=clearance_fields(labels, box.grid, images.fissures is not None, keep, tell, before, changed),
         lumen_depth=replace(depth, corners=keep("lumen_depth.corners", depth.corners)),
         tree=tree,
         motion=motion,
@@ -222,66 +209,48 @@ def build_lung(
     )
 
 
-@frozen_record
-class _Sides:
-    """The left and the right lung: points `(N, 3)` LPS mm of both, and the septum where they touch.
-
-    The septum is None, and there are no points, if the lungs cannot be told apart.
-    """
-
-    points_lps: tuple[Float, Float]
-    septum: Mask | None
-
-
-def _sides(images: PatientImages, box: WorkingBox) -> _Sides:
-    tissue = images.lung.array & ~images.lumen.array
+def _sides(images: PatientImages, box: WorkingBox) -> tuple[tuple[Float, Float], Mask | None]:
+    """Return points of both lungs, and the septum where they touch; none if they cannot be told apart."""
+    tissue = box.cut(images.lung.array & ~images.lumen.array)
     if images.wall is not None:
-        tissue &= ~images.wall.array
-    tissue = box.cut(tissue)
+        tissue &= ~box.cut(images.wall.array)
     sides = coarse_sides(tissue, box.grid)
     if sides is None:
-        return _Sides(points_lps=(np.zeros((0, 3)), np.zeros((0, 3))), septum=None)
-    return _Sides(points_lps=points_of_sides(*sides, box.grid), septum=border_of(*sides, tissue))
+        return (np.zeros((0, 3)), np.zeros((0, 3))), None
+    return points_of_sides(*sides, box.grid), border_of(*sides, tissue)
 
 
-def _warnings(images: PatientImages, sides: _Sides) -> Iterator[str]:
+def _warnings(images: PatientImages, septum: Mask | None) -> Iterator[str]:
     """Yield what labels make of masks that are not as they should be."""
     if images.wall is None:
         yield "No airway wall mask: the wall is covered by the margins alone."
     overlap = int(np.count_nonzero(images.vessels.array & images.lumen.array))
     if overlap:
         yield f"{overlap} voxels were both airway lumen and vessel; they are kept as lumen."
-    if sides.septum is None:
+    if septum is None:
         yield "The mask could not be split into two lungs: taken as one lung."
-    elif sides.septum.any():
-        count = int(np.count_nonzero(sides.septum))
+    elif count := int(np.count_nonzero(septum)):
         yield f"Left and right lung touch in the mask: a septum of {count} voxels keeps them apart."
 
 
 def _labels(
-    images: PatientImages,
-    box: WorkingBox,
-    tree: AirwayTree,
-    sides: _Sides,
-    reused: Reused,
-    changed: Window | None,
-) -> UInt16:
+    images: PatientImages, box: WorkingBox, tree: AirwayTree, septum: Mask | None,
+    before: Lung | None, changed: Window | None,
+) -> UInt16:  # fmt: skip
     """Return the labels: those of before but for the window that has changed, if that is known."""
-    if changed is not None and reused.lung is not None:
-        labels = np.array(reused.lung.labels, order="F")
+    if before is not None and changed is not None:
+        labels = np.array(before.labels, order="F")
         airway = labels[changed] & ~np.uint16(structures.VESSEL | structures.FISSURE | structures.OUTSIDE)
-        labels[changed] = airway | _without_airway(images, box, sides, changed)
+        labels[changed] = airway | _without_airway(images, box, septum, changed)
     else:
-        labels = _without_airway(images, box, sides)
+        labels = _without_airway(images, box, septum, box.whole)
         at, codes = _airway_codes(images, box, tree)
         labels[at] |= codes
     structures.close_border(labels)
     return labels
 
 
-def _without_airway(
-    images: PatientImages, box: WorkingBox, sides: _Sides, part: Window | None = None
-) -> UInt16:
+def _without_airway(images: PatientImages, box: WorkingBox, septum: Mask | None, part: Window) -> UInt16:
     """Return what labels say of vessels, fissures and the outside, in a window of the box."""
 
     def cut(name: str) -> Mask:
@@ -293,8 +262,8 @@ def _without_airway(
     outside = ~(cut("lung") | airway | vessels)
     if images.nodules is not None:
         outside &= ~cut("nodules")
-    if sides.septum is not None:
-        outside |= sides.septum if part is None else sides.septum[part]
+    if septum is not None:
+        outside |= septum[part]
     labels: UInt16 = outside * np.uint16(structures.OUTSIDE)
     labels |= vessels * np.uint16(structures.VESSEL)
     if images.fissures is not None:
@@ -330,33 +299,24 @@ def _airway_codes(images: PatientImages, box: WorkingBox, tree: AirwayTree) -> t
 
 
 def clearance_fields(
-    labels: UInt16,
-    grid: Grid,
-    *,
-    fissures: bool = False,
-    keep: Keep = lambda _name, array: array,
-    tell: Progress = lambda _step: None,
-    before: Lung | None = None,
-    changed: Window | None = None,
-) -> dict[str, DistanceField]:
+    labels: UInt16, grid: Grid, fissures: bool = False, keep: Keep = lambda _name, array: array,
+    tell: Progress = lambda _step: None, before: Lung | None = None, changed: Window | None = None,
+) -> dict[str, DistanceField]:  # fmt: skip
     """Return the fields of the clearance to each structure and to all of them, by name.
 
-    Args:
-        labels: `(ni, nj, nk)`, those of `anatomy.structures`.
-        fissures: Whether fissures are known; then there are fields of them.
-        keep, tell: `keep` and `progress` of `build_lung`.
-        before: A lung whose labels, on the same grid, differ in the window `changed` alone.
+    `labels` `(ni, nj, nk)` are those of `anatomy.structures`; there are fields of fissures if these are
+    known.  `keep` and `tell` are `keep` and `progress` of `build_lung`.  The labels of the lung `before`, on
+    the same grid, differ in the window `changed` alone.
     """
-    known = {} if before is None or changed is None else before.fields
-    whole, geometry = window(np.zeros(3, dtype=np.int64), np.array(grid.shape) + 1), corner_geometry(grid)
+    known = {} if before is None else before.fields
+    geometry, whole = corner_geometry(grid), (slice(None), slice(None), slice(None))
     fields: dict[str, DistanceField] = {}
-    differs: dict[str, Window | None] = {}
+    differs: dict[str, list[Window]] = {}
 
-    def add(name: str, corners: UInt16, box: Window | None) -> None:
-        """Add a field, and note in which corners it is another one than before."""
+    def add(name: str, corners: UInt16, *boxes: Window) -> None:
         kept = keep(f"fields.{name}.corners", corners)
         fields[name] = DistanceField(name=name, corners=kept, geometry=geometry)
-        differs[name] = box
+        differs[name] = list(boxes)
 
     def add_single(name: str) -> None:
         tell(f"clearance to {name}")
@@ -368,21 +328,19 @@ def clearance_fields(
         if name not in known or before is None or changed is None:
             add(name, distance_corners(solid(whole), grid.spacing_mm), whole)
         elif np.array_equal(solid(changed), (before.labels[changed] & bits) != 0):
-            add(name, known[name].corners, None)
+            add(name, known[name].corners)
         else:
             add(name, *renewed_corners(known[name].corners, solid, changed, grid.spacing_mm))
 
     def add_union(name: str, *parts: str) -> None:
-        boxes = [box for part in parts if (box := differs[part]) is not None]
-        if name in known and not boxes:
-            add(name, known[name].corners, None)
-            return
-        first, box = fields[parts[0]].corners, hull(boxes)
-        corners = np.array(known[name].corners if name in known else first, order="F")
-        corners[box] = first[box]
-        for part in parts[1:]:
-            np.minimum(corners[box], fields[part].corners[box], out=corners[box])
-        add(name, corners, box)
+        corners = known[name].corners if name in known else fields[parts[0]].corners
+        boxes = [box for part in parts for box in differs[part]] if name in known else [whole]
+        corners = np.array(corners, order="F") if boxes else corners
+        for box in boxes:
+            corners[box] = fields[parts[0]].corners[box]
+            for part in parts[1:]:
+                np.minimum(corners[box], fields[part].corners[box], out=corners[box])
+        add(name, corners, *boxes)
 
     for name in SINGLE_FIELDS[:3]:
         add_single(name)

@@ -122,28 +122,29 @@ def renewed_corners(
 ) -> tuple[UInt16, Window]:
     """Return what `distance_corners` makes of a mask of which a window has changed, and where it differs.
 
-    Args:
-        before: Distances before the change.
-        solid: Returns the voxels of a window of the mask.
-
-    Returns:
-        - (UInt16, Window) - The distances, and a box of corners beyond which they are those of before.
+    `before` are the distances before the change, and `solid` returns the voxels of a window of the mask.
     """
     spacing, shape = np.asarray(spacing_mm, dtype=np.float64), np.array(before.shape)
     first, last = (np.array([getattr(axis, end) for axis in changed]) for end in ("start", "stop"))
     low, high = _reach_of_change(before, first, last, spacing)
     box, inner = window(low, high), window(first - low, last + 1 - low)
     corners: UInt16 = np.array(before, order="F")
-    part = corners[box]
+    part, points = corners[box], np.zeros(high - low, dtype=np.bool_, order="F")
     start = np.maximum(first - 1, 0)
     around = touched_corners(solid(window(start, np.minimum(last + 1, shape - 1))))
     touched = around[window(first - start, last + 1 - start)]
-    points = np.zeros(part.shape, dtype=np.bool_, order="F")
     points[inner] = (part[inner] == 0) & ~touched
     if points.any():
-        # Corners to which one that is gone was the nearest are measured anew.
-        start, stop = bounds(distance_corners(points, spacing, CENTRES) <= part)
-        part[window(start, stop)] = _distances_in(low + start, low + stop, before, solid, spacing)
+        # Where the nearest corner is gone, all that may be the nearest now is measured.
+        near = bounds(distance_corners(points, spacing, CENTRES) <= part)
+        begin, end, most, reach_mm = low + near[0], low + near[1], 0, -1.0
+        while most >= reach_mm * kernel.UNITS_PER_MM - 2.0:
+            reach_mm = (max(most, int(part[window(*near)].max())) + 3.0) / kernel.UNITS_PER_MM
+            pad = np.ceil(reach_mm / spacing).astype(np.int64) + 1
+            start, stop = np.maximum(begin - pad, 0), np.minimum(end - 1 + pad, shape - 1)
+            found = distance_corners(solid(window(start, stop)), spacing)[window(begin - start, end - start)]
+            most = int(found.max())
+        part[window(*near)] = found
     points[inner] = touched
     np.minimum(part, distance_corners(points, spacing, CENTRES), out=part)
     return corners, box
@@ -157,50 +158,23 @@ def _reach_of_change(before: UInt16, first: Int, last: Int, spacing: Float) -> t
     near as the nearest obstacle before.  So a box holds all that differs if on its faces the change is
     farther, by a diagonal of a voxel for the way to the next corner and back.
     """
-    shape, diagonal = np.array(before.shape), float(np.linalg.norm(spacing))
-    pads = np.full((2, 3), 8)
-    while True:
+    shape, pads, wider = np.array(before.shape), np.full((2, 3), 8), np.ones((2, 3), dtype=np.bool_)
+    while wider.any():
         low, high = np.maximum(first - pads[0], 0), np.minimum(last + pads[1] + 1, shape)
         squares = [
             (np.maximum(np.maximum(a - at, at - b), 0) * side) ** 2
             for a, b, at, side in zip(first, last, map(np.arange, low, high), spacing, strict=True)
         ]
-        wider = np.zeros((2, 3), dtype=np.bool_)
+        wider[...] = False
         for axis, end in np.ndindex(3, 2):
             at = (low[axis], high[axis] - 1)[end]
             if 0 < at < shape[axis] - 1:
-                face = [slice(a, b) for a, b in zip(low, high, strict=True)]
-                face[axis] = slice(at, at + 1)
-                i, j, k = (
-                    each[cut.start - a : cut.stop - a]
-                    for each, cut, a in zip(squares, face, low, strict=True)
-                )
-                away = np.sqrt(i[:, None, None] + j[:, None] + k)
-                wider[end, axis] = (away <= _most_mm(before[tuple(face)]) + diagonal).any()
-        if not wider.any():
-            return low, high
+                face = before[window(low, high)].take([at - low[axis]], axis)
+                i, j, k = (each[[-end]] if n == axis else each for n, each in enumerate(squares))
+                away_mm = np.sqrt(i[:, None, None] + j[:, None] + k) - float(np.linalg.norm(spacing))
+                wider[end, axis] = (away_mm * kernel.UNITS_PER_MM <= face + 2.0).any()
         pads += wider * (pads // 2)
-
-
-def _distances_in(
-    low: Int, high: Int, before: UInt16, solid: Callable[[Window], Mask], spacing: Float
-) -> UInt16:
-    """Return the distances at corners of a box, from as much of the mask as may be nearest to one of them."""
-    last = np.array(before.shape) - 1
-    reach_mm = float(_most_mm(before[window(low, high)].max()))
-    while True:
-        pad = np.ceil(reach_mm / spacing).astype(np.int64) + 1
-        start, stop = np.maximum(low - pad, 0), np.minimum(high - 1 + pad, last)
-        found = distance_corners(solid(window(start, stop)), spacing)[window(low - start, high - start)]
-        most_mm = float(_most_mm(found.max()))
-        if most_mm <= reach_mm:
-            return found
-        reach_mm = most_mm
-
-
-def _most_mm(stored: ArrayLike) -> Float:
-    """Return the most that stored distances stand for, mm."""
-    return (np.asarray(stored, dtype=np.float64) + 2.0) / kernel.UNITS_PER_MM
+    return low, high
 
 
 def distance_field(name: str, mask: Mask, grid: Grid, half_voxels: float = SOLID) -> DistanceField:

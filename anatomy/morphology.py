@@ -1,7 +1,6 @@
 """Masks by whole voxels: bounds, growing, closing with a ball by exact distances, filling of holes."""
 
 import itertools
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -95,15 +94,6 @@ def components(mask: Mask) -> tuple[Int, Int]:
 def window(low: Int, high: Int) -> Window:
     """Return the voxels `low <= ijk < high` as an index."""
     i, j, k = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return i, j, k
-
-
-def hull(boxes: Sequence[Window]) -> Window:
-    """Return the smallest box that holds all of some boxes."""
-    i, j, k = (
-        slice(min(each.start for each in axis), max(each.stop for each in axis))
-        for axis in zip(*boxes, strict=True)
-    )
     return i, j, k
 
 

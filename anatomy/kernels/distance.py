@@ -1,9 +1,8 @@
 """The exact Euclidean distance transform of a lattice, one axis after the other, in whole numbers.
 
 The square of a distance is the sum over the axes of `steps**2 * square`, where `square` is that of the voxel
-size in units of `4**-shift` mm^2, rounded down.  Whole numbers have one sum and one least sum in whatever
-order they are taken.  So a box of points, with all that may be nearest to them, has the very distances of the
-whole.
+size in units of `4**-shift` mm^2.  Whole numbers have one sum and one least sum in whatever order they are
+taken: a box of points, with all that may be nearest to them, has the very distances of the whole.
 """
 
 import math
@@ -13,91 +12,66 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, kernel
 
 NONE = 65535
-"""Stands for no distance, and for all that are as far."""
+"""Stands for no distance, and for all that are as far, in units of `2**-UNIT_SHIFT` mm."""
 UNIT_SHIFT = 8
-"""Distances are stored in units of `2**-UNIT_SHIFT` mm."""
 
 
 @inner_kernel
-def _is_first(line, square, i, u, at):
-    """Tell whether point `i` of a line is as near to the place `at` as point `u`."""
-    return line[i] + square * (at - i) * (at - i) <= line[u] + square * (at - u) * (at - u)
+def _spread(line, square, sites, heights, starts):
+    """Turn the squares that are known along a line, negative where none is, into the least at each place.
 
-
-@inner_kernel
-def _nearest_along(line, count, square, sites, starts):
-    """Find which of the `count` points of a line is nearest to each; return how many are nearest to any.
-
-    `line` has the squares of the distances beside it, negative where there is none.  Point `sites[m]` is
-    nearest from `starts[m]` to before `starts[m + 1]`.
+    Point `sites[m]`, with the square `heights[m]`, is nearest from `starts[m]` to before `starts[m + 1]`.
     """
-    found = 0
+    count, m = line.shape[0], -1
     for u in range(count):
         if line[u] < 0:
             continue
-        while found > 0 and not _is_first(line, square, sites[found - 1], u, starts[found - 1]):
-            found -= 1
-        start = 0
-        if found > 0:
-            i = sites[found - 1]
+        while m >= 0:
+            at = starts[m]
+            if heights[m] + square * (at - sites[m]) ** 2 <= line[u] + square * (at - u) ** 2:
+                break
+            m -= 1
+        at = 0
+        if m >= 0:
+            i = sites[m]
             # The quotient may be off by one where it is nearly whole: which point is nearer decides.
-            crossing = (square * (u - i) * (u + i) + line[u] - line[i]) / (2.0 * square * (u - i))
-            start = max(int(min(crossing, 2.0 * count)) - 1, starts[found - 1])
-            while start < count and _is_first(line, square, i, u, start):
-                start += 1
-        if start < count:
-            sites[found], starts[found] = u, start
-            found += 1
-    return found
+            crossing = (square * (u - i) * (u + i) + line[u] - heights[m]) / (2.0 * square * (u - i))
+            at = max(int(min(crossing, 2.0 * count)) - 1, starts[m])
+            while at < count and heights[m] + square * (at - i) ** 2 <= line[u] + square * (at - u) ** 2:
+                at += 1
+        if at < count:
+            m += 1
+            sites[m], heights[m], starts[m] = u, line[u], at
+    for at in range(count - 1, -1, -1):
+        if m >= 0:
+            line[at] = heights[m] + square * (at - sites[m]) ** 2
+            m -= starts[m] == at
 
 
 @kernel(nogil=True)
 def fill_distances(near, squares, shift):
-    """Turn `near` `(ni, nj, nk)` uint16, 0 at points and NONE elsewhere, into distances, rounded down.
-
-    `squares` `(3,)` int64 are those of the voxel sizes in units of `4**-shift` mm^2, at least 1.
-    """
+    """Turn `near` `(ni, nj, nk)` uint16, 0 at points and NONE elsewhere, into distances, rounded down."""
     ni, nj, nk = near.shape
-    most = max(ni, nj)
-    sites, starts = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    sites, heights, starts = np.zeros((3, max(ni, nj)), np.int64)
     line, plane = np.zeros(nj, np.int64), np.zeros((nj, ni), np.int64)
     # Steps to the nearest point along the last axis: up, then down.
-    for k in range(1, nk):
+    for n in range(1, 2 * nk - 1):
+        k, beside = (n, n - 1) if n < nk else (2 * nk - 2 - n, 2 * nk - 1 - n)
         for j in range(nj):
             for i in range(ni):
-                if near[i, j, k - 1] < min(near[i, j, k], NONE - 1):
-                    near[i, j, k] = near[i, j, k - 1] + 1
-    for k in range(nk - 2, -1, -1):
-        for j in range(nj):
-            for i in range(ni):
-                if near[i, j, k + 1] < min(near[i, j, k], NONE - 1):
-                    near[i, j, k] = near[i, j, k + 1] + 1
+                if near[i, j, beside] < min(near[i, j, k], NONE - 1):
+                    near[i, j, k] = near[i, j, beside] + 1
     for k in range(nk):
         for i in range(ni):
             for j in range(nj):
                 steps = np.int64(near[i, j, k])
-                line[j] = -1 if steps == NONE else squares[2] * steps * steps
-            m = _nearest_along(line, nj, squares[1], sites, starts) - 1
-            for j in range(nj - 1, -1, -1):
-                if m < 0:
-                    plane[j, i] = -1
-                    continue
-                site = sites[m]
-                plane[j, i] = line[site] + squares[1] * (j - site) * (j - site)
-                if j == starts[m]:
-                    m -= 1
+                line[j] = -1 if steps == NONE else squares[2] * steps**2
+            _spread(line, squares[1], sites, heights, starts)
+            plane[:, i] = line
         for j in range(nj):
-            row = plane[j]
-            m = _nearest_along(row, ni, squares[0], sites, starts) - 1
-            for i in range(ni - 1, -1, -1):
-                if m < 0:
-                    near[i, j, k] = NONE
-                    continue
-                site = sites[m]
-                square = row[site] + squares[0] * (i - site) * (i - site)
-                if i == starts[m]:
-                    m -= 1
-                root = int(math.sqrt(float(square)))
-                if root * root > square:
-                    root -= 1
-                near[i, j, k] = min(root >> (shift - UNIT_SHIFT), NONE)
+            _spread(plane[j], squares[0], sites, heights, starts)
+            for i in range(ni):
+                square = plane[j, i]
+                root = int(math.sqrt(float(max(square, 0))))
+                root -= root * root > square
+                near[i, j, k] = NONE if square < 0 else min(root >> (shift - UNIT_SHIFT), NONE)

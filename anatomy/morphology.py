@@ -176,10 +176,13 @@ def near(mask: Mask, reach_mm: float, spacing_mm: ArrayLike) -> Mask:
     return found
 
 
-def distance_mm(mask: Mask, spacing_mm: ArrayLike) -> Float32:
-    """Return the distance of every True voxel to the nearest False one, centre to centre; 0 elsewhere."""
+def distance_mm(mask: Mask, spacing_mm: ArrayLike, *, bordered: bool = False) -> Float32:
+    """Return the distance of every True voxel to the nearest False one, centre to centre; 0 elsewhere.
+
+    With `bordered` False voxels lie all around the image.
+    """
     import edt
 
     spacing = tuple(float(s) for s in np.asarray(spacing_mm))
     solid = np.require(mask, requirements=["F", "W"])  # the transform takes no read-only arrays
-    return np.asarray(edt.edt(solid, anisotropy=spacing, order="F", parallel=_THREADS))
+    return np.asarray(edt.edt(solid, anisotropy=spacing, order="F", black_border=bordered, parallel=_THREADS))

@@ -8,7 +8,7 @@ import numpy as np
 
 from anatomy.base.typed import Array, Float, Int32, Mask
 from anatomy.grid import Grid
-from anatomy.morphology import at_label_borders, pieces_of
+from anatomy.morphology import at_label_borders, distance_mm, pieces_of
 
 
 def coarse_sides(tissue: Mask, grid: Grid) -> tuple[Int32, tuple[int, ...]] | None:
@@ -37,11 +37,9 @@ def _pooled(mask: Mask, step: tuple[int, ...]) -> Mask:
 
 def grow_sides(core: Mask, tissue: Mask, axes: Float) -> Int32 | None:
     """Label the lungs 1 and 2 over `tissue`, told apart by `core`; `axes` has voxel axes in LPS mm."""
-    import edt
     from skimage.segmentation import watershed
 
-    spacing = tuple(map(float, np.linalg.norm(axes, axis=0)))
-    depth = edt.edt(core, anisotropy=spacing, order="F", black_border=True)
+    depth = distance_mm(core, np.linalg.norm(axes, axis=0), bordered=True)
     # What erosion leaves of the smaller lung is at least this share of all tissue, else it is a crumb.
     least = 0.01 * float(np.count_nonzero(core))
     # Erosions that are tried in turn: none if the lungs do not touch, up to the width of a broad bridge.

@@ -224,18 +224,16 @@ def grow(ct: CoarseCt, seed: Int, outside: Mask) -> Mask:
 
 def _main_part(ct: CoarseCt, grown: Mask) -> tuple[Mask, tuple[str, ...]]:
     """Return trachea and main bronchi: the parts nearest to the two first generations of the tree."""
-    import edt
-
     from anatomy.tree import tree_from_mask
 
     low, high = bounds(grown, 1)
     box = window(low, high)
     part = np.asfortranarray(grown[box])
-    depth = edt.edt(part, anisotropy=ct.spacing_mm, black_border=True)
+    depth = distance_mm(part, ct.spacing_mm, bordered=True)
     # Airways narrower than this share of the trachea's radius are left to the segmentation of the airways.
     wide_mm = 0.35 * float(np.percentile(depth[depth > 0], 99))
     core = depth >= wide_mm
-    wide = part & (edt.edt(np.asfortranarray(~core), anisotropy=ct.spacing_mm) <= wide_mm)
+    wide = part & (distance_mm(~core, ct.spacing_mm) <= wide_mm)
     grid = ct.grid.crop(low, high)
     main = np.zeros(grown.shape, dtype=np.bool_, order="F")
     try:

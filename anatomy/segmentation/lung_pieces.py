@@ -150,13 +150,12 @@ def _notches_of(ct: CoarseCt, side: Mask, other: Mask, hull: Mask, closing_mm: f
 
 def _near_hull(lungs: Mask, ct: CoarseCt) -> Mask:
     """Mark, in every axial slice, what lies close below the convex hull of both lungs."""
-    import edt
     from skimage.morphology import convex_hull_image
 
     near = np.zeros(lungs.shape, dtype=np.bool_, order="F")
     for k in np.flatnonzero(lungs.any(axis=(0, 1))):
         hull = np.asfortranarray(convex_hull_image(lungs[:, :, k]))
-        depth = edt.edt(hull, anisotropy=ct.spacing_mm[:2], order="F", black_border=True)
+        depth = distance_mm(hull, ct.spacing_mm[:2], bordered=True)
         # Half the diameter of the largest nodule that is not called a mass, 30 mm.
         near[:, :, k] = hull & (depth <= 15.0)
     # Near the edge of the image a closing cannot tell notch from outside.
@@ -207,12 +206,10 @@ def _background(ct: CoarseCt) -> Mask:
 
 
 def _airway(ct: CoarseCt, hull: Mask, seed_lps: Float | None) -> CentralAirway:
-    import edt
-
     if seed_lps is not None:
         return grow_from(ct, ~hull, seed_lps)
     air = np.asfortranarray((ct.hu < AIRWAY_BELOW_HU) & hull)
-    radius = edt.edt(air, anisotropy=ct.spacing_mm, order="F", black_border=True)
+    radius = distance_mm(air, ct.spacing_mm, bordered=True)
     widest = np.unravel_index(int(np.argmax(radius)), radius.shape)
     if not radius[widest] >= LEAST_AIRWAY_RADIUS_MM:
         raise AnatomyError(

@@ -129,11 +129,9 @@ def _majority(votes: Int16, masks: list[Mask]) -> Mask:
 
 def centre_of(nodule: Mask, grid: Grid) -> Float:
     """Return the voxel of the largest nodule that is deepest inside it, LPS mm `(3,)`."""
-    import edt
-
     low, high = bounds(nodule)
     part = np.asfortranarray(largest_piece(nodule[window(low, high)]))
-    depth = edt.edt(part, anisotropy=tuple(map(float, grid.spacing_mm)), order="F", black_border=True)
+    depth = distance_mm(part, grid.spacing_mm, bordered=True)
     return grid.lps(low + np.asarray(np.unravel_index(int(np.argmax(depth)), depth.shape)))
 
 

@@ -9,7 +9,7 @@ from anatomy.base.errors import AnatomyError
 from anatomy.base.records import frozen_record
 from anatomy.base.typed import Bool, Float, Float32, Int, Int32
 from anatomy.grid import Grid, Volume
-from anatomy.morphology import bounds, window
+from anatomy.morphology import bounds, distance_mm, window
 from anatomy.tree.bridge import Piece, join_pieces
 
 CONNECT_26 = np.ones((3, 3, 3), dtype=bool)
@@ -48,7 +48,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     """
     from scipy import ndimage
 
-    grid, box = _crop_to_content(mask)
+    grid, box = crop_to_content(mask)
     labels, count = ndimage.label(box, CONNECT_26)
     sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
     main = int(np.argmax(sizes[1:])) + 1
@@ -78,14 +78,14 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     outside, holes = ndimage.label(~solid)
     solid = solid if holes < 2 else np.asarray(outside != outside[0, 0, 0])
     cavity_voxels = int(solid.sum()) - int((lumen | bridges).sum())
-    depth = _depth_of_centres(lumen, grid.spacing_mm)
+    depth = distance_mm(lumen, grid.spacing_mm, bordered=True)
     return PreparedLumen(
         grid=grid,
         lumen=lumen,
         solid=solid,
         bridges=bridges,
         depth_mm=depth,
-        solid_depth_mm=_depth_of_centres(solid, grid.spacing_mm) if cavity_voxels else depth,
+        solid_depth_mm=distance_mm(solid, grid.spacing_mm, bordered=True) if cavity_voxels else depth,
         report=TreeReport(
             gaps_bridged=tuple(gaps),
             pieces_left_out=left_out,
@@ -120,7 +120,7 @@ def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOu
     return tuple(found)
 
 
-def _crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
+def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     """Return grid and array of the bounding box of a mask, with one empty layer all around."""
     array = np.asarray(mask.array != 0) if mask.array.dtype != bool else mask.array
     start, stop = bounds(array)
@@ -133,14 +133,6 @@ def _crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     box = np.zeros(tuple(stop - start + 2), dtype=bool, order="F")
     box[1:-1, 1:-1, 1:-1] = array[window(start, stop)]
     return mask.grid.crop(start - 1, stop + 1), box
-
-
-def _depth_of_centres(mask: Bool, spacing_mm: Float) -> Float32:
-    """Return the distance of every voxel centre in `mask` to the nearest one outside it, mm."""
-    import edt
-
-    spacing = tuple(float(s) for s in spacing_mm)
-    return np.asarray(edt.edt(mask, anisotropy=spacing, black_border=True, parallel=1))
 
 
 def _pieces(labels: Int32, sizes: Int, main: int, spacing_mm: Float) -> list[Piece]:

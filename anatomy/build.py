@@ -25,7 +25,7 @@ from anatomy.sides import border_of, coarse_sides, points_of_sides
 Progress = Callable[[str], None]
 Keep = Callable[[str, Array], Array]
 
-FORMAT = 5
+FORMAT = 6
 """Version of the processing: raise it when the same images give another lung."""
 
 PAD_VOXELS = 2

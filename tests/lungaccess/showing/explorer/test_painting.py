@@ -86,6 +86,11 @@ def test_corrections_are_there_when_the_patient_is_opened_again(painted: Patient
     with_client(painted, talk)
     lung = lung_of(painted)
     assert not lung.label_at(np.array(point)) & VESSEL
+    anew = la.load_patient(painted.patient, cache=painted.patient.parent / "other")
+    assert np.array_equal(lung.labels, anew.labels), "made of the lung before, or from nothing"
+    assert lung.fields.keys() == anew.fields.keys()
+    for name, field in anew.fields.items():
+        assert np.array_equal(lung.fields[name].corners, field.corners), name
     assert any("vessel" in words and "erased" in words for words in lung.warnings)
 
 

@@ -48,7 +48,7 @@ def prepare_lumen(mask: Volume, max_gap_mm: float) -> PreparedLumen:
     """
     from scipy import ndimage
 
-    grid, box = crop_to_content(mask)
+    grid, box = _crop_to_content(mask)
     labels, count = ndimage.label(box, CONNECT_26)
     sizes = np.bincount(labels.ravel(order="K"), minlength=count + 1)
     main = int(np.argmax(sizes[1:])) + 1
@@ -120,7 +120,7 @@ def _left_out(lumen: Bool, pieces: list[Piece], grid: Grid) -> tuple[PieceLeftOu
     return tuple(found)
 
 
-def crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
+def _crop_to_content(mask: Volume) -> tuple[Grid, Bool]:
     """Return grid and array of the bounding box of a mask, with one empty layer all around."""
     array = np.asarray(mask.array != 0) if mask.array.dtype != bool else mask.array
     start, stop = bounds(array)

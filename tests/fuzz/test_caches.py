@@ -14,6 +14,7 @@ import pytest
 import lungaccess as la
 from anatomy.base.cache_entries import cache_entries
 from anatomy.base.checksums import DamagedCacheWarning
+from anatomy.base.records import plain_values
 from anatomy.kept_records import kept
 from anatomy.lung import Lung
 from anatomy.motion.source import MotionSource
@@ -77,10 +78,9 @@ def atlases(small_lung: Lung, monkeypatch: pytest.MonkeyPatch) -> Cache:
     monkeypatch.setattr(atlas_store, "build_atlas", again)
 
     def opened(cache: Path) -> Any:
-        parts = atlas_store._parts(open_atlas(small_lung, SYSTEM, cache=cache, **COARSE))
-        return {
-            name: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v for name, v in parts.items()
-        }
+        atlas, arrays = open_atlas(small_lung, SYSTEM, cache=cache, **COARSE), dict[str, Any]()
+        values = plain_values((atlas.motions, atlas.deployments), "", arrays)
+        return {"values": values, **{name: np.ascontiguousarray(each) for name, each in arrays.items()}}
 
     other = replace(SYSTEM, margins=replace(SYSTEM.margins, segmentation_margin_mm=0.7))
     return Cache(opened, lambda cache: open_atlas(small_lung, other, cache=cache, **COARSE), made)
@@ -93,7 +93,7 @@ def shapes(monkeypatch: pytest.MonkeyPatch) -> Cache:
     fine, coarse = ShapeGrid(stop_mm=10.0, rotations=4), ShapeGrid(stop_mm=20.0, rotations=4)
     enumerated = {grid: design_shapes.tube_shapes(tubes, ShapeLimits(), grid) for grid in (fine, coarse)}
     monkeypatch.setattr(
-        design_shapes, "tube_shapes", lambda *design: made.append("shapes") or enumerated[design[-1]]
+        design_shapes, "tube_shapes", lambda *design, **_: made.append("shapes") or enumerated[design[-1]]
     )
 
     def opened(cache: Path, grid: ShapeGrid = fine) -> Any:

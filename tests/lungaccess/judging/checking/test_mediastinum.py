@@ -19,7 +19,7 @@ from lungaccess.problem.target import point_target
 from lungaccess.problem.task import Task
 from stages.needle import SHORTEST
 
-AHEAD_MM = 15.0
+AHEAD_MM = 5.0
 WANTED = 3
 
 

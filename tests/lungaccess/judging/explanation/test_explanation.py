@@ -27,10 +27,11 @@ from lungaccess.problem.system import System
 from lungaccess.problem.target import Target
 from lungaccess.problem.task import Task
 from stages.needle import direct_arcs
-from tests.lungaccess.points import FAR_TARGET
 from tests.stages.scenes import lung_of
 
 SYSTEM = la.load_system("ultrathin")
+FAR_TARGET = "lps:27.9,-25.7,39.2"
+"""No single arc of the system's needle leads there; one of a tighter needle would."""
 AtlasOf = Callable[[System, Callable[[float], None]], la.Atlas]
 
 

@@ -118,6 +118,8 @@ class Answers:
             self._painting = Painting.of(self._source, self.lung)
         system = self._system(question.what_if)
         self._atlas(system, turn)
+        if question.tool == "open":
+            return
         around = question.points[-1] if question.points else tuple(self.lung.tree.carina_lps.tolist())
         size_ml = self._painting.draw(question, self._ct)
         lung = self._painting.renewed(turn.tell)

@@ -101,7 +101,8 @@ class PaintQuestion(_Question):
     """Correct the masks by hand: the answer is what the patient is from now on, at once for all questions.
 
     Args:
-        tool: See `anatomy.strokes.Stroke`; `undo` takes the last stroke back.
+        tool: See `anatomy.strokes.Stroke`; `undo` takes the last stroke back; `open` only reads the masks,
+            so that the first stroke need not wait for them.
         points: Along the stroke.
         radius_mm: Of the brush; of a fill how far it may reach.
         normal: Normal of the slice in which alone brush and fill act.
@@ -109,7 +110,7 @@ class PaintQuestion(_Question):
         what_if: The system whose atlas is made anew with the lung.
     """
 
-    tool: Literal["paint", "erase", "fill", "cut", "join", "undo"]
+    tool: Literal["open", "paint", "erase", "fill", "cut", "join", "undo"]
     structure: Literal["airway", "vessel", "fissure", "nodule"] = "vessel"
     points: Annotated[tuple[Point, ...], Len(0, 400)] = ()
     radius_mm: Annotated[float, quantity("radius of the brush", at_least=0.2, at_most=30.0)] = 2.0

@@ -29,7 +29,7 @@ from lungaccess.problem.system import System, load_system
 from lungaccess.problem.target import Target, point_target
 from lungaccess.problem.task import Task
 from tests.lungaccess.conftest import breathing
-from tests.lungaccess.planning.coupled.planning import KUNTZ_TARGET
+from tests.lungaccess.planning.coupled.planning import KUNTZ_SEED, KUNTZ_TARGET
 from tests.lungaccess.two_curved_tubes import COARSE, two_curved_tubes
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "composition.md"
@@ -131,7 +131,7 @@ class Table:
     def asked(self, cell: Cell) -> tuple[Any, dict[str, Any]]:
         """Return the system and the words of a request."""
         system, _atlas, _target = self.case(cell.system)
-        words: dict[str, Any] = {"seed": 1, "iterations": 1, **GOALS[cell.goal]}
+        words: dict[str, Any] = {"seed": KUNTZ_SEED, "iterations": 1, **GOALS[cell.goal]}
         match cell.constraint:
             case "phases":
                 words["phases"] = (0.2, 0.6)

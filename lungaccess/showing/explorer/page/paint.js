@@ -74,6 +74,7 @@ export function connectPainting(page) {
     other = null;
     say("");
   });
-  // The surfaces of the 3-D view are made anew with the page.
-  box.addEventListener("toggle", () => !box.open && changed && location.reload());
+  // The masks are read before the first stroke.  The surfaces of the 3-D view are made anew with the page.
+  const open = () => page.asker.ask("paint", { tool: "open", what_if: whatIf(page.state.asked) }, () => {}, say);
+  box.addEventListener("toggle", () => (box.open ? open() : changed && location.reload()));
 }

@@ -79,6 +79,7 @@ def main() -> None:
 
         await timed("exits", "prepare", what_if=asked["what_if"])
         await timed("first plan", "plan", **asked)
+        await timed("masks", "paint", tool="open", what_if=asked["what_if"])
         for place in places(lung, given.structure, given.seed + 1, given.strokes):
             stroke = {"tool": "paint", "structure": given.structure, "points": [place.tolist()]}
             await timed("stroke", "paint", "painted", **stroke, radius_mm=2.0, what_if=asked["what_if"])

@@ -52,6 +52,8 @@ def test_a_stroke_is_known_to_all_that_answers_and_can_be_taken_back(painted: Pa
     async def talk(client: Client, _explorer: Explorer) -> None:
         place = (await client.first("place", point=point))[0]
         assert place["tissue"] != "vessel"
+        assert (await client.first("paint", tool="open"))[0]["answer"] == "end"
+        assert not corrections_file(painted.patient).exists()
         first = (await client.first("plan", target=text, what_if=what_if()))[0]
         assert first["answer"] == "plan"
         found, _ = await client.first(

@@ -179,7 +179,10 @@ def _compiled_in_order(waits_for: dict[int, set[int]], processes: int) -> Iterat
         except BrokenProcessPool:
             return
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            # Who stops early does not wait for what is being compiled; else the pool ends in order: left to
+            # itself, it may complain of closed pipes when the program ends.
+            if left or under_way:
+                pool.shutdown(wait=False, cancel_futures=True)
 
 
 def encoded(kind: Any) -> Any:

@@ -19,8 +19,10 @@ import pytest
 import lungaccess as la
 from anatomy.base.unfinished import MARK
 from anatomy.io.frames import LPS_FROM_RAS
+from anatomy.io.images import read_volume
 from lungaccess.cli import terminal
 from lungaccess.cli.app import main
+from tests.anatomy.io.series import write_series
 from tests.pages import PAGES, ROOT, RUN, Block, blocks, name_of
 
 MAY_SAY_NO = ("advise", "benchmark", "certify", "needle", "plan", "tubes")
@@ -70,6 +72,8 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "lesions.txt").write_text("\n".join(points[:2]))
     (here / "ct.nii.gz").symlink_to(here / "PATIENT" / "ct.nii.gz")
     (here / "nodule.nii.gz").symlink_to(here / "PATIENT" / "nodules.nii.gz")
+    ct, uids = read_volume(here / "ct.nii.gz"), {"StudyInstanceUID": "1.2.3", "FrameOfReferenceUID": "1.2.4"}
+    write_series(here / "SERIES", ct, **uids)
     return here
 
 

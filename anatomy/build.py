@@ -35,8 +35,10 @@ PAD_VOXELS = 2
 SINGLE_FIELDS = ("airway", "vessel", "pleura", "fissure")
 """The clearance fields that are made of a structure; the others are made of these."""
 
-MARKED = ("lung", "lumen", "wall", "fissure_band", "vessels", "nodules", "fissures")
-"""The images that labels are made of; the last three mark voxels by themselves."""
+AROUND = ("lung", "lumen", "wall", "fissure_band")
+"""The images that say of far voxels what they are: tree, branches and septum follow from them."""
+MARKED = ("vessels", "nodules", "fissures")
+"""The images that say in labels what their own voxels are, and nothing of others."""
 CUT = ("nodules", "nodule_labels", "cost", "lobes", "fissure_band")
 """The images that a lung holds as they were read, cut to its box."""
 AS_READ = ("name", "kind", "starts", "targets_lps", "start_names", "target_names", "sources")
@@ -89,11 +91,11 @@ class Reused:
         same = old is not None and np.array_equal(old.grid.lps_from_ijk, images.grid.lps_from_ijk)
         if old is None or not same or (old.fissures is None) != (images.fissures is None):
             return None
-        pairs = {name: (_array_of(old, name), _array_of(images, name)) for name in MARKED}
-        if not all(_are_same(*pairs[name]) for name in MARKED[:4]):
+        if not all(_are_same(_array_of(old, name), _array_of(images, name)) for name in AROUND):
             return None
         found = np.zeros(images.grid.shape, dtype=np.bool_, order="F")
-        for one, other in map(pairs.__getitem__, MARKED[4:]):
+        for name in MARKED:
+            one, other = _array_of(old, name), _array_of(images, name)
             if one is not other:
                 found |= np.not_equal(False if one is None else one, False if other is None else other)
         return window(*bounds(found))

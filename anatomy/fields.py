@@ -113,7 +113,7 @@ def distance_corners(mask: Mask, spacing_mm: ArrayLike, half_voxels: float = SOL
             expected=f"at most {LONGEST} voxels a side, whose sides differ by less than a factor of 256",
             remedy="Resample the masks to voxels that are nearly cubes",
         )
-    fill_distances(near, squares, shift)
+    fill_distances(near, squares, shift - round(math.log2(kernel.UNITS_PER_MM)))
     return near
 
 

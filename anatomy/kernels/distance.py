@@ -1,8 +1,9 @@
 """The exact Euclidean distance transform of a lattice, one axis after the other, in whole numbers.
 
 The square of a distance is the sum over the axes of `steps**2 * square`, where `square` is that of the voxel
-size in units of `4**-shift` mm^2.  Whole numbers have one sum and one least sum in whatever order they are
-taken: a box of points, with all that may be nearest to them, has the very distances of the whole.
+size in fine units, a power of two of which is 1 mm.  Whole numbers have one sum and one least sum in whatever
+order they are taken: a box of points, with all that may be nearest to them, has the very distances of the
+whole.
 """
 
 import math
@@ -12,8 +13,7 @@ import numpy as np
 from anatomy.kernels.compiling import inner_kernel, kernel
 
 NONE = 65535
-"""Stands for no distance, and for all that are as far, in units of `2**-UNIT_SHIFT` mm."""
-UNIT_SHIFT = 8
+"""Stands for no distance, and for all that are as far, in the units in which distances are stored."""
 
 
 @inner_kernel
@@ -50,7 +50,10 @@ def _spread(line, square, sites, heights, starts):
 
 @kernel(nogil=True)
 def fill_distances(near, squares, shift):
-    """Turn `near` `(ni, nj, nk)` uint16, 0 at points and NONE elsewhere, into distances, rounded down."""
+    """Turn `near` `(ni, nj, nk)` uint16, 0 at points and NONE elsewhere, into distances, rounded down.
+
+    `squares` (3,) int64 are those of the voxel sizes in fine units, of which a stored unit has `2**shift`.
+    """
     ni, nj, nk = near.shape
     sites, heights, starts = np.zeros((3, max(ni, nj)), np.int64)
     line, plane = np.zeros(nj, np.int64), np.zeros((nj, ni), np.int64)
@@ -74,4 +77,4 @@ def fill_distances(near, squares, shift):
                 square = plane[j, i]
                 root = int(math.sqrt(float(max(square, 0))))
                 root -= root * root > square
-                near[i, j, k] = NONE if square < 0 else min(root >> (shift - UNIT_SHIFT), NONE)
+                near[i, j, k] = NONE if square < 0 else min(root >> shift, NONE)

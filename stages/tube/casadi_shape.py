@@ -327,8 +327,8 @@ def derive_arrival(
     out = np.asarray(insertions_mm, dtype=np.float64)
     if np.ptp(turned) > 0.0:
         # Tubes that are turned against each other may have several shapes: theirs is the one they come to.
-        alone, together_with = (derive_shape(tubes, rotations_rad, out, needle=one) for one in (None, needle))
-        return alone.base_from_tip, together_with.base_from_tip
+        alone, loaded = (derive_shape(tubes, rotations_rad, out, needle=each) for each in (None, needle))
+        return alone.base_from_tip, loaded.base_from_tip
     beta = out - [tube.length_mm for tube in tubes]
     rear = out[0] + BEYOND_MM - needle.length_mm
     before = CasadiTubes(tubes).solve(turned, beta)
